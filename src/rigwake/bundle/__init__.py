@@ -1,0 +1,1 @@
+"""Rig bundle adjustment: the rig from all observations at once."""

@@ -1,0 +1,1 @@
+"""Rigid-body and projective geometry: transforms, interpolation, alignment, two views, the Earth."""

@@ -1,0 +1,1 @@
+"""Hand-eye calibration: the rig from trajectories."""

@@ -1,0 +1,1 @@
+"""Intrinsic calibration from chessboards, AprilGrids and ChArUco boards."""

@@ -1,0 +1,1 @@
+"""Odometry: from tracks, inertial and satellite measurements to one trajectory per camera."""

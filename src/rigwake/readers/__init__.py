@@ -1,0 +1,1 @@
+"""Readers: every recording and trajectory format, turned into the same values."""

@@ -1,0 +1,1 @@
+"""The harbour simulator: recordings with known truth."""
