@@ -13,14 +13,15 @@ LAYERS = [
     ["geometry"],
     ["cameras"],
     ["trajectory", "rig"],
-    ["recording", "calibration"],
+    ["recording", "tracks", "calibration"],
     ["readers", "writers"],
     ["intrinsics"],
     ["tracking"],
+    ["bundle"],  # least squares over states, landmarks and shared parameters: for one camera and for a rig
     ["odometry"],
     ["sync"],
     ["handeye"],
-    ["bundle"],
+    ["adjustment"],  # the rig problem: initial values, cross-camera landmarks, outlier rounds
     ["simulate"],
     ["evaluate"],
     ["exporters"],

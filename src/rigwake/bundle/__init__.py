@@ -1,1 +1,1 @@
-"""Rig bundle adjustment: the rig from all observations at once."""
+"""Least squares over trajectory states, landmarks and shared parameters, for one camera or a whole rig."""

@@ -1,0 +1,1 @@
+"""The rig problem: from initial values to the adjusted rig, with verdicts."""
