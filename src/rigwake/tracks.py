@@ -2,15 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+import zipfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake.atomic import atomic_path
 from rigwake.errors import InputError
 from rigwake.geometry.so3 import Array
 
 Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class TrackingReport:
+    """What happened while tracking one camera.
+
+    frames: given; of these `frames_used` were tracked, `frames_black` showed nothing, `frames_repeated` were
+    copies of the frame before, `frames_missing` could not be decoded. tracks, observations: what was found.
+    frames_per_second: wall-clock speed, decoding included.
+    """
+
+    frames: int
+    frames_used: int
+    frames_black: int
+    frames_repeated: int
+    frames_missing: int
+    tracks: int
+    observations: int
+    frames_per_second: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +44,7 @@ class Tracks:
     frame_indices: (M,) row of `timestamps_ns` of each observation. track_ids: (M,) which point it is.
     pixels: (M, 2). bearings_cam: (M, 3) unit vectors. std_px: (M,) predicted standard deviation of a pixel
     coordinate. An observation appears at most once per (frame, track).
+    report: what happened while tracking, if known.
     """
 
     camera: str
@@ -30,6 +54,7 @@ class Tracks:
     pixels: Array
     bearings_cam: Array
     std_px: Array
+    report: TrackingReport | None = None
 
     def __post_init__(self) -> None:
         m = len(self.frame_indices)
@@ -52,4 +77,42 @@ class Tracks:
             self.pixels[index],
             self.bearings_cam[index],
             self.std_px[index],
+            self.report,
         )
+
+    def save(self, path: Path) -> None:
+        """Write a compressed .npz, whole or not at all."""
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(
+                file,
+                camera=np.array(self.camera),
+                timestamps_ns=self.timestamps_ns,
+                frame_indices=self.frame_indices,
+                track_ids=self.track_ids,
+                pixels=self.pixels,
+                bearings_cam=self.bearings_cam,
+                std_px=self.std_px,
+                report=np.array(json.dumps(asdict(self.report)) if self.report else ""),
+            )
+
+
+def load_tracks(path: Path) -> Tracks:
+    """Read what `Tracks.save` wrote; nothing in the file is executed. Raises InputError."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            report = str(arrays["report"])
+            return Tracks(
+                str(arrays["camera"]),
+                arrays["timestamps_ns"].astype(np.int64),
+                arrays["frame_indices"].astype(np.int64),
+                arrays["track_ids"].astype(np.int64),
+                arrays["pixels"].astype(np.float64),
+                arrays["bearings_cam"].astype(np.float64),
+                arrays["std_px"].astype(np.float64),
+                TrackingReport(**json.loads(report)) if report else None,
+            )
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{path} holds no tracks ({type(error).__name__}: {error}).",
+            remedy="Delete it and run the command again: tracks are recomputed from the recording.",
+        ) from error

@@ -1,0 +1,187 @@
+"""From a camera's images to its tracks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigwake.cameras.base import Mask
+from rigwake.errors import UsageError
+from rigwake.geometry.so3 import Array
+from rigwake.recording import CameraStream, Image
+from rigwake.tracking.features import detect_corners
+from rigwake.tracking.klt import follow
+from rigwake.tracking.masks import CameraMask, beyond_lens
+from rigwake.tracking.options import TrackingOptions
+from rigwake.tracks import TrackingReport, Tracks
+
+_MIN_CONTRAST = 2.0  # grey levels: an image with less standard deviation shows nothing
+_MIN_STRENGTH = 400.0  # (grey levels / px)^2 over 7x7 px: 0.05 px per grey level of noise
+
+Observed = tuple[NDArray[np.int64], Array, Array]
+"""Track ids (N,), pixels (N, 2), std_px (N,) seen in one frame."""
+
+
+def track_camera(
+    stream: CameraStream,
+    options: TrackingOptions | None = None,
+    mask: CameraMask | None = None,
+    *,
+    indices: NDArray[np.int64] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Tracks:
+    """Follow points through the images of one camera.
+
+    stream: must have a model, which turns pixels into bearings and predicts how patches deform.
+    mask: regions without static scene points; what lies beyond the lens is always left out.
+    indices: which frames of the stream to use (all by default). progress: told the number of frames done.
+    The same input gives the same tracks. Raises UsageError if the camera has no model.
+    """
+    options = options or TrackingOptions()
+    if stream.model is None:
+        raise UsageError(
+            f"camera {stream.name} has no intrinsics.",
+            consequence="Pixels cannot be turned into bearings.",
+            remedy="Give a model for it, or calibrate one with `rigwake intrinsics`.",
+        )
+    usable = ~beyond_lens(stream.model)
+    if mask is not None:
+        usable &= mask.usable
+    chosen = np.arange(len(stream)) if indices is None else np.asarray(indices)
+    front_end = KltFrontEnd(options, usable)
+    run = _Run()
+    row_of_index = {int(index): row for row, index in enumerate(chosen)}
+    started = time.perf_counter()
+    for done, frame in enumerate(stream.frames(chosen)):
+        kind = run.judge(frame.image)
+        if kind == "usable":
+            row = row_of_index[frame.index]
+            run.add(row, front_end.step(frame.image, frame.timestamp_ns))
+        if progress is not None:
+            progress(done + 1)
+    return run.tracks(stream, chosen, time.perf_counter() - started)
+
+
+@dataclass
+class _Run:
+    """What has been observed so far, and what happened to the frames."""
+
+    rows: list[NDArray[np.int64]] = field(default_factory=list)
+    seen: list[Observed] = field(default_factory=list)
+    black: int = 0
+    repeated: int = 0
+    last: Image | None = None
+
+    def judge(self, image: Image) -> str:
+        """Whether a frame is `usable`, `black` or a `repeated` copy of the one before."""
+        if self.last is not None and np.array_equal(self.last, image):
+            self.repeated += 1
+            return "repeated"
+        self.last = image
+        if float(image[::4, ::4].std()) < _MIN_CONTRAST:
+            self.black += 1
+            return "black"
+        return "usable"
+
+    def add(self, row: int, observed: Observed) -> None:
+        """Keep the observations of the frame that is row `row` of the tracks' stamps."""
+        self.rows.append(np.full(len(observed[0]), row, dtype=np.int64))
+        self.seen.append(observed)
+
+    def tracks(self, stream: CameraStream, chosen: NDArray[np.int64], elapsed_s: float) -> Tracks:
+        """Everything seen, as one value; points seen only once are left out."""
+        assert stream.model is not None
+        ids = np.concatenate([np.empty(0, np.int64), *(s[0] for s in self.seen)])
+        pixels = np.concatenate([np.empty((0, 2)), *(s[1] for s in self.seen)])
+        std_px = np.concatenate([np.empty(0), *(s[2] for s in self.seen)])
+        rows = np.concatenate([np.empty(0, np.int64), *self.rows])
+        bearings, valid = stream.model.unproject(pixels)
+        lengths = np.bincount(ids, minlength=1)
+        keep = valid & (lengths[ids] >= 2)
+        report = TrackingReport(
+            frames=len(chosen),
+            frames_used=len(self.seen),
+            frames_black=self.black,
+            frames_repeated=self.repeated,
+            frames_missing=len(chosen) - len(self.seen) - self.black - self.repeated,
+            tracks=int(np.count_nonzero(lengths >= 2)),
+            observations=int(keep.sum()),
+            frames_per_second=len(chosen) / max(elapsed_s, 1e-9),
+        )
+        return Tracks(
+            stream.name,
+            stream.timestamps_ns[chosen],
+            rows[keep],
+            ids[keep],
+            pixels[keep],
+            bearings[keep],
+            std_px[keep],
+            report,
+        )
+
+
+class KltFrontEnd:
+    """Corners followed from frame to frame."""
+
+    def __init__(self, options: TrackingOptions, usable: Mask) -> None:
+        self.options = options
+        self.usable = usable
+        self.next_id = 0
+        self.ids = np.empty(0, dtype=np.int64)
+        self.pixels = np.empty((0, 2))
+        self.image: Image | None = None
+        self.timestamp_ns = 0
+
+    def step(self, image: Image, timestamp_ns: int) -> Observed:
+        """Observations in the next image."""
+        options = self.options
+        gap_s = (timestamp_ns - self.timestamp_ns) * 1e-9
+        if self.image is None or gap_s > options.max_gap_s:
+            self._forget()
+        else:
+            pixels, believed = follow(
+                self.image,
+                image,
+                self.pixels,
+                self.pixels,
+                window_px=options.window_px,
+                levels=options.levels,
+                max_forward_backward_px=options.max_forward_backward_px,
+            )
+            believed &= inside(self.usable, pixels)
+            self.ids, self.pixels = self.ids[believed], pixels[believed]
+        if len(self.ids) < options.redetect_below * options.max_features:
+            self._detect(image)
+        self.image, self.timestamp_ns = image, timestamp_ns
+        return self.ids, self.pixels, np.full(len(self.ids), 0.3)
+
+    def _forget(self) -> None:
+        self.ids, self.pixels = self.ids[:0], self.pixels[:0]
+
+    def _detect(self, image: Image) -> None:
+        corners = detect_corners(
+            image,
+            self.usable,
+            self.pixels,
+            wanted=self.options.max_features - len(self.ids),
+            cell_px=self.options.cell_px,
+            min_distance_px=self.options.min_distance_px,
+            min_strength=_MIN_STRENGTH,
+        )
+        ids = np.arange(self.next_id, self.next_id + len(corners))
+        self.next_id += len(corners)
+        self.ids = np.concatenate([self.ids, ids])
+        self.pixels = np.concatenate([self.pixels, corners])
+
+
+def inside(usable: Mask, pixels: Array) -> Mask:
+    """Which pixels (N, 2) lie on the image and where `usable` is True: (N,)."""
+    height, width = usable.shape
+    nearest = np.rint(np.nan_to_num(pixels, nan=-1.0)).astype(np.int64)
+    x, y = nearest[:, 0], nearest[:, 1]
+    on_image = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    return np.asarray(on_image & usable[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)])

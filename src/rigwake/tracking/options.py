@@ -1,0 +1,38 @@
+"""What can be chosen about tracking."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from rigwake.errors import UsageError
+
+FrontEndName = Literal["klt", "sift", "fast-brief", "orb"]
+
+
+@dataclass(frozen=True)
+class TrackingOptions:
+    """Options of a front end; the defaults suit 640x480 to 1280x960 images at 5 to 30 Hz.
+
+    front_end: `klt` follows corners from frame to frame; the others match descriptors.
+    max_features: points followed at a time. redetect_below: share of `max_features` under which new points
+        are looked for. cell_px: side of the grid cells over which points are balanced.
+    min_distance_px: spacing of points. window_px, levels: the pyramidal Lucas-Kanade search.
+    max_forward_backward_px: how far a point may land from where it started when followed there and back.
+    max_gap_s: points are not followed across a longer gap between usable frames.
+    """
+
+    front_end: FrontEndName = "klt"
+    max_features: int = 400
+    redetect_below: float = 0.9
+    cell_px: int = 40
+    min_distance_px: int = 10
+    window_px: int = 21
+    levels: int = 4
+    max_forward_backward_px: float = 1.0
+    max_gap_s: float = 0.6
+
+    def __post_init__(self) -> None:
+        for name in ("max_features", "cell_px", "min_distance_px", "window_px", "levels"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"tracking option {name} must be at least 1, not {getattr(self, name)}.")
