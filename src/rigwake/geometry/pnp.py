@@ -1,0 +1,188 @@
+"""Pose of one camera from known points and the unit bearings that see them (PnP), also beyond 90 degrees."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from rigwake.errors import EstimationError
+from rigwake.geometry import so3
+from rigwake.geometry.ransac import Budget, search
+from rigwake.geometry.se3 import SE3
+from rigwake.geometry.so3 import Array
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class AbsolutePose:
+    """A camera's pose, its right-tangent covariance for the given noise, and the points that agree."""
+
+    world_from_cam: SE3
+    covariance: Array
+    inliers: Mask
+
+
+@numba.njit(cache=True)
+def _bearing_angles(R: Array, c: Array, points: Array, bearings: Array) -> Array:
+    """Angles between bearings and the directions to points; R, c: world_from_cam."""
+    out = np.empty(len(points))
+    for n in range(len(points)):
+        d0, d1, d2 = points[n, 0] - c[0], points[n, 1] - c[1], points[n, 2] - c[2]
+        x = R[0, 0] * d0 + R[1, 0] * d1 + R[2, 0] * d2
+        y = R[0, 1] * d0 + R[1, 1] * d1 + R[2, 1] * d2
+        z = R[0, 2] * d0 + R[1, 2] * d1 + R[2, 2] * d2
+        b = bearings[n]
+        cx, cy, cz = y * b[2] - z * b[1], z * b[0] - x * b[2], x * b[1] - y * b[0]
+        out[n] = np.arctan2(np.sqrt(cx * cx + cy * cy + cz * cz), x * b[0] + y * b[1] + z * b[2])
+    return out
+
+
+def bearing_angles(world_from_cam: SE3, points_world: Array, bearings_cam: Array) -> Array:
+    """Angle between each bearing and the direction to its point, radians: (N, 3), (N, 3) -> (N,)."""
+    return np.asarray(
+        _bearing_angles(
+            np.ascontiguousarray(world_from_cam.rotation),
+            np.ascontiguousarray(world_from_cam.translation),
+            np.ascontiguousarray(points_world),
+            np.ascontiguousarray(bearings_cam),
+        )
+    )
+
+
+@numba.njit(cache=True)
+def _normal_equations(
+    R: Array, c: Array, points: Array, bearings: Array, stds: Array, scale: float
+) -> tuple[Array, Array, float]:
+    """J^T W J, J^T W r and the Cauchy cost of whitened residuals `u - b` tangent to the sphere at b.
+
+    `u` is the direction to the point in the camera frame X / |X|; a right perturbation [w, v] of
+    world_from_cam moves X by `X x w - v`.
+    """
+    H, g, cost = np.zeros((6, 6)), np.zeros(6), 0.0
+    J = np.zeros((3, 6))
+    for n in range(len(points)):
+        X = R.T @ (points[n] - c)
+        norm = np.sqrt(X[0] ** 2 + X[1] ** 2 + X[2] ** 2)
+        u = X / max(norm, 1e-12)
+        b = bearings[n]
+        along = u[0] * b[0] + u[1] * b[1] + u[2] * b[2]
+        # a direction on the far side keeps the full residual |u - b|, so that it never looks like an inlier
+        r = (u - b * along if along > 0 else u - b) / stds[n]
+        s = (r[0] ** 2 + r[1] ** 2 + r[2] ** 2) / scale**2
+        weight = 1.0 / (1.0 + s)
+        cost += 0.5 * scale**2 * np.log1p(s)
+        J[0, 0], J[0, 1], J[0, 2] = 0.0, -X[2], X[1]
+        J[1, 0], J[1, 1], J[1, 2] = X[2], 0.0, -X[0]
+        J[2, 0], J[2, 1], J[2, 2] = -X[1], X[0], 0.0
+        for i in range(3):
+            J[i, 3 + i] = -1.0
+        P = np.eye(3) - np.outer(u, u)
+        Q = np.eye(3) - np.outer(b, b) if along > 0 else np.eye(3)
+        K = Q @ (P @ J) / (max(norm, 1e-12) * stds[n])
+        H += weight * (K.T @ K)
+        g += weight * (K.T @ r)
+    return H, g, cost
+
+
+def refine_absolute_pose(
+    world_from_cam: SE3,
+    points_world: Array,
+    bearings_cam: Array,
+    angle_stds: Array,
+    *,
+    robust_scale: float = 3.0,
+    iterations: int = 10,
+) -> tuple[SE3, Array]:
+    """Levenberg-Marquardt on bearing residuals with a Cauchy loss: the pose and its covariance (6, 6).
+
+    angle_stds: (N,) standard deviation of a bearing per axis, radians. robust_scale: in standard deviations.
+    The covariance is the inverse of the weighted normal matrix; infinite where that is singular.
+    """
+    points, bearings = np.ascontiguousarray(points_world), np.ascontiguousarray(bearings_cam)
+    stds = np.ascontiguousarray(angle_stds, dtype=np.float64)
+
+    def linearise(x: SE3) -> tuple[Array, Array, float]:
+        R, c = np.ascontiguousarray(x.rotation), np.ascontiguousarray(x.translation)
+        return _normal_equations(R, c, points, bearings, stds, robust_scale)
+
+    H, g, cost = linearise(world_from_cam)
+    damping = 1e-6
+    for _ in range(iterations):
+        step = -np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-12), g)
+        moved = world_from_cam.retract(step)
+        new_H, new_g, new_cost = linearise(moved)
+        if new_cost <= cost:
+            done = cost - new_cost < 1e-6 * cost
+            world_from_cam, H, g, cost = moved, new_H, new_g, new_cost
+            damping = max(damping * 0.1, 1e-9)
+            if done:
+                break
+        else:
+            damping *= 100
+    try:
+        covariance = np.linalg.inv(H)
+    except np.linalg.LinAlgError:
+        covariance = np.full((6, 6), np.inf)
+    return world_from_cam, np.asarray(covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class _Resection:
+    points: Array
+    bearings: Array
+    gates: Array
+    sample_size: int = 3
+
+    @property
+    def count(self) -> int:
+        return len(self.points)
+
+    def solve(self, sample: NDArray[np.int64]) -> Sequence[SE3]:
+        poses = poselib.p3p(self.bearings[sample], self.points[sample])
+        return [SE3(so3.nearest_rotation(p.R), p.t).inverse() for p in poses if np.isfinite(p.Rt).all()]
+
+    def errors(self, model: SE3) -> Array:
+        return bearing_angles(model, self.points, self.bearings) / self.gates
+
+    def polish(self, model: SE3, inliers: Mask) -> SE3:
+        kept = self.points[inliers], self.bearings[inliers], self.gates[inliers]
+        return refine_absolute_pose(model, *kept, iterations=5)[0]
+
+
+def absolute_pose(
+    points_world: Array,
+    bearings_cam: Array,
+    *,
+    max_angles: Array,
+    angle_stds: Array,
+    rng: np.random.Generator,
+    budget: Budget | None = None,
+) -> AbsolutePose:
+    """Pose from N points and bearings, some of them wrong: P3P (Persson and Nordberg 2018), RANSAC, refined.
+
+    points_world, bearings_cam: (N, 3). max_angles: (N,) inlier gates; angle_stds: (N,) standard deviations; both
+    in radians, both may be single numbers.
+    Raises EstimationError with fewer than three points or if no sample gave a pose.
+    """
+    points = np.ascontiguousarray(points_world, dtype=np.float64)
+    bearings = np.ascontiguousarray(bearings_cam, dtype=np.float64)
+    if points.shape != bearings.shape or not (np.isfinite(points).all() and np.isfinite(bearings).all()):
+        raise EstimationError("Points and bearings must be finite (N, 3) arrays of equal length.")
+    gates = np.broadcast_to(np.asarray(max_angles, dtype=np.float64), (len(points),))
+    found = search(_Resection(points, bearings, gates), rng, budget)
+    return refined(found.model, points, bearings, max_angles=gates, angle_stds=angle_stds)
+
+
+def refined(
+    world_from_cam: SE3, points_world: Array, bearings_cam: Array, *, max_angles: Array, angle_stds: Array
+) -> AbsolutePose:
+    """Refine from a good guess (the previous frame's motion) and judge every point anew."""
+    stds = np.broadcast_to(np.asarray(angle_stds, dtype=np.float64), (len(points_world),))
+    x, covariance = refine_absolute_pose(world_from_cam, points_world, bearings_cam, stds)
+    return AbsolutePose(x, covariance, bearing_angles(x, points_world, bearings_cam) <= max_angles)
