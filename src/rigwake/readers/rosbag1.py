@@ -1,0 +1,205 @@
+"""Index of a ROS 1 bag (format 2.0), read in one pass over its record headers.
+
+The pass does not need the index at the end of the file, so a bag that was never closed, or was cut off,
+yields what it still holds. Format: http://wiki.ros.org/Bags/Format/2.0
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigwake.errors import InputError
+from rigwake.readers.channels import BagIndex, Channel, joined
+from rigwake.readers.chunks import Chunk, ChunkedPayloads, read_chunk
+from rigwake.recording import Finding
+
+MAGIC = b"#ROSBAG V2.0\n"
+_MESSAGE, _INDEX, _CHUNK, _CONNECTION = 2, 4, 5, 7
+_MAX_HEADER_BYTES = 2**20  # message definitions are the largest headers, some ten kilobytes
+_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
+
+
+class Record(NamedTuple):
+    """Fields of a record's header, and where its data lies."""
+
+    fields: dict[str, bytes]
+    data_position: int
+    data_bytes: int
+
+    @property
+    def operation(self) -> int:
+        """What kind of record this is; InputError if it does not say."""
+        return self.number("op", "<B")
+
+    def number(self, name: str, layout: str) -> int:
+        """An integer field; InputError if it is missing or of another size."""
+        try:
+            return int(struct.unpack(layout, self.fields[name])[0])
+        except (KeyError, struct.error) as error:
+            raise InputError(f"a record lacks its field {name!r}") from error
+
+
+@dataclass
+class _Scan:
+    """What the pass has gathered so far."""
+
+    chunks: list[Chunk] = field(default_factory=list)
+    connections: dict[int, tuple[str, str, str]] = field(default_factory=dict)
+    entries: dict[int, list[tuple[int, NDArray[np.void]]]] = field(default_factory=dict)
+    indexed_chunks: set[int] = field(default_factory=set)
+    problems: list[str] = field(default_factory=list)
+
+
+def index_rosbag1(path: Path) -> BagIndex:
+    """Index a ROS 1 bag; damage is reported in `findings`. InputError if it is no such bag or encrypted."""
+    file = os.open(path, os.O_RDONLY)
+    try:
+        if os.pread(file, len(MAGIC), 0) != MAGIC:
+            raise InputError(f"{path.name} is not a ROS 1 bag of format 2.0.")
+        scan = _Scan()
+        _scan_records(file, os.fstat(file).st_size, scan)
+        _complete_from_chunks(file, scan)
+    finally:
+        os.close(file)
+    findings = tuple(
+        Finding("error", "", f"{problem}; what could be read is kept.") for problem in scan.problems
+    )
+    return BagIndex("ros1 bag", joined(_channels(path, scan)), findings)
+
+
+def _scan_records(file: int, file_bytes: int, scan: _Scan) -> None:
+    position = len(MAGIC)
+    while position < file_bytes:
+        try:
+            record = parse_record(os.pread(file, 4096, position), position, file)
+            operation = record.operation
+            if record.data_position + record.data_bytes > file_bytes:
+                if operation == _CHUNK:
+                    _add_chunk(record, file_bytes - record.data_position, scan)
+                raise InputError("a record runs past the end of the file")
+            if operation == _CHUNK:
+                _add_chunk(record, record.data_bytes, scan)
+            elif operation == _INDEX:
+                _add_index(file, record, scan)
+            elif operation == _CONNECTION:
+                _add_connection(os.pread(file, record.data_bytes, record.data_position), record, scan)
+        except InputError as error:
+            scan.problems.append(f"The bag is cut off or damaged at byte {position} ({error.cause})")
+            return
+        position = record.data_position + record.data_bytes
+
+
+def parse_record(start: bytes, position: int, file: int | None = None) -> Record:
+    """The record whose first bytes are `start`, at `position` of the file (or of a chunk).
+
+    A header longer than `start` is read from `file`. Raises InputError if it is cut off or not a record.
+    """
+    if len(start) < 8:
+        raise InputError("a record is cut off")
+    (header_bytes,) = struct.unpack_from("<I", start, 0)
+    if header_bytes > _MAX_HEADER_BYTES:
+        raise InputError(f"a record header claims {header_bytes} bytes")
+    if 8 + header_bytes > len(start) and file is not None:
+        start = os.pread(file, 8 + header_bytes, position)
+    if 8 + header_bytes > len(start):
+        raise InputError("a record header is cut off")
+    (data_bytes,) = struct.unpack_from("<I", start, 4 + header_bytes)
+    fields = parse_fields(start[4 : 4 + header_bytes])
+    return Record(fields, position + 8 + header_bytes, data_bytes)
+
+
+def parse_fields(header: bytes) -> dict[str, bytes]:
+    """The `name=value` fields of a header; InputError if they do not fill it."""
+    fields, at = {}, 0
+    while at + 4 <= len(header):
+        (size,) = struct.unpack_from("<I", header, at)
+        name, separator, value = header[at + 4 : at + 4 + size].partition(b"=")
+        at += 4 + size
+        if not separator or at > len(header):
+            raise InputError("a record header is damaged")
+        fields[name.decode("ascii", "replace")] = value
+    return fields
+
+
+def _add_chunk(record: Record, stored_bytes: int, scan: _Scan) -> None:
+    compression = record.fields.get("compression", b"").decode("ascii", "replace")
+    content_bytes = record.number("size", "<I")
+    if compression == "none":
+        content_bytes = min(content_bytes, stored_bytes)
+    scan.chunks.append(Chunk(record.data_position, stored_bytes, content_bytes, compression))
+
+
+def _add_index(file: int, record: Record, scan: _Scan) -> None:
+    if not scan.chunks:
+        raise InputError("an index stands before any chunk")
+    count = record.number("count", "<I")
+    if count * _ENTRY.itemsize != record.data_bytes:
+        raise InputError("an index has a wrong length")
+    entries = np.frombuffer(os.pread(file, record.data_bytes, record.data_position), _ENTRY)
+    chunk_row = len(scan.chunks) - 1
+    scan.entries.setdefault(record.number("conn", "<I"), []).append((chunk_row, entries))
+    scan.indexed_chunks.add(chunk_row)
+
+
+def _add_connection(details: bytes, record: Record, scan: _Scan) -> None:
+    fields = parse_fields(details)
+    texts = [
+        raw.decode("utf-8", "replace")
+        for raw in (record.fields.get("topic", b""), fields.get("type", b""), fields.get("md5sum", b""))
+    ]
+    scan.connections[record.number("conn", "<I")] = (texts[0], texts[1], texts[2])
+
+
+def _complete_from_chunks(file: int, scan: _Scan) -> None:
+    """Walk through chunks that have no index, and those that hold connections not yet known."""
+    unknown = {rows[0][0] for conn, rows in scan.entries.items() if conn not in scan.connections}
+    for chunk_row in sorted((set(range(len(scan.chunks))) - scan.indexed_chunks) | unknown):
+        try:
+            _walk_chunk(read_chunk(file, scan.chunks[chunk_row]), chunk_row, scan)
+        except InputError as error:
+            scan.problems.append(f"Chunk {chunk_row} is lost ({error.cause})")
+
+
+def _walk_chunk(content: bytes, chunk_row: int, scan: _Scan) -> None:
+    found: dict[int, list[tuple[int, int, int]]] = {}
+    at = 0
+    while at < len(content):
+        try:
+            record = parse_record(content[at : at + 4096], at)
+            end = record.data_position + record.data_bytes
+            if end > len(content):
+                break  # the message that was being written when the file was cut
+            if record.operation == _CONNECTION:
+                _add_connection(content[record.data_position : end], record, scan)
+            elif record.operation == _MESSAGE:
+                stamp = record.number("time", "<Q")
+                entry = (stamp & 0xFFFFFFFF, stamp >> 32, at)
+                found.setdefault(record.number("conn", "<I"), []).append(entry)
+        except InputError:
+            break
+        at = end
+    if chunk_row not in scan.indexed_chunks:
+        for connection, entries in found.items():
+            scan.entries.setdefault(connection, []).append((chunk_row, np.array(entries, _ENTRY)))
+
+
+def _channels(path: Path, scan: _Scan) -> list[Channel]:
+    channels = []
+    for connection, (topic, message_type, digest) in scan.connections.items():
+        parts = sorted(scan.entries.get(connection, []), key=lambda part: part[0])
+        entries = np.concatenate([np.empty(0, _ENTRY), *(part for _, part in parts)])
+        chunk_rows = np.repeat([row for row, _ in parts], [len(part) for _, part in parts]).astype(np.int32)
+        payloads = ChunkedPayloads(
+            path, "ros1", tuple(scan.chunks), chunk_rows, entries["offset"].astype(np.int64)
+        )
+        stamps = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
+        full_type = message_type if "/msg/" in message_type else message_type.replace("/", "/msg/", 1)
+        channels.append(Channel(topic, full_type, "ros1", stamps, payloads, digest))
+    return channels

@@ -1,0 +1,60 @@
+"""Repairs that every reader makes the same way: time order, duplicates, values that are not finite."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigwake.geometry.so3 import Array
+from rigwake.recording import Finding, Stamps
+
+Rows = NDArray[np.int64]
+
+
+def time_order(sensor: str, timestamps_ns: Stamps) -> tuple[Rows, list[Finding]]:
+    """Rows that put the stamps in strictly increasing order (of equal stamps the first stays), and what
+    that repaired."""
+    stamps = np.asarray(timestamps_ns, dtype=np.int64)
+    steps = np.diff(stamps)
+    order = np.argsort(stamps, kind="stable")
+    fresh = np.concatenate([[True], np.diff(stamps[order]) > 0])[: len(order)]
+    findings = []
+    if (backward := int((steps < 0).sum())) > 0:
+        worst_s = -float(steps.min()) * 1e-9
+        severity = "error" if worst_s > 1.0 else "warning"
+        message = f"time goes back {backward} times, by up to {worst_s:.3g} s; samples were sorted."
+        findings.append(Finding(severity, sensor, message))
+    if (duplicates := int((~fresh).sum())) > 0:
+        message = f"{duplicates} samples repeat the stamp of another; the first of each was kept."
+        findings.append(Finding("warning", sensor, message))
+    return order[fresh], findings
+
+
+def finite_rows(sensor: str, *columns: ArrayLike) -> tuple[Rows, list[Finding]]:
+    """Rows in which every column is finite, and how many were dropped."""
+    good = np.ones(len(np.asarray(columns[0])), dtype=bool)
+    for column in columns:
+        values = np.asarray(column, dtype=np.float64)
+        good &= np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+    if good.all():
+        return np.arange(len(good)), []
+    message = f"{int((~good).sum())} samples hold NaN or infinite values; they were dropped."
+    return np.flatnonzero(good), [Finding("warning", sensor, message)]
+
+
+def usable_rows(sensor: str, timestamps_ns: Stamps, *columns: ArrayLike) -> tuple[Rows, tuple[Finding, ...]]:
+    """Rows that are finite, in strictly increasing time order."""
+    finite, dropped = finite_rows(sensor, *columns)
+    order, sorted_findings = time_order(sensor, np.asarray(timestamps_ns)[finite])
+    return finite[order], (*dropped, *sorted_findings)
+
+
+def symmetric_psd(covariances: Array, fallback: float) -> Array:
+    """Covariances (N, k, k) made symmetric; those that are zero, negative or not finite become
+    `fallback * I`."""
+    symmetric = (covariances + np.swapaxes(covariances, -1, -2)) / 2
+    finite = np.isfinite(symmetric).all(axis=(1, 2))
+    smallest = np.full(len(symmetric), -1.0)
+    smallest[finite] = np.linalg.eigvalsh(symmetric[finite])[:, 0]
+    unusable = smallest <= 0
+    return np.where(unusable[:, None, None], fallback * np.eye(symmetric.shape[-1]), symmetric)
