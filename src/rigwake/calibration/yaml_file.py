@@ -27,16 +27,16 @@ _HEADER = f"""\
 """
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Plain YAML and JSON values: arrays to lists, NaN and infinities to null."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return plain(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
@@ -90,7 +90,7 @@ def calibration_to_dict(calibration: Calibration) -> dict[str, Any]:
         "checks": calibration.checks,
         "provenance": calibration.provenance,
     }
-    return dict(_plain(content))
+    return dict(plain(content))
 
 
 def save_calibration(calibration: Calibration, path: Path | str) -> None:
