@@ -9,13 +9,30 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigwake.cameras.base import CameraModel
+from rigwake.cameras.double_sphere import DoubleSphere
+from rigwake.cameras.eucm import EnhancedUnified
+from rigwake.cameras.fov import FieldOfView
 from rigwake.cameras.kannala_brandt import KannalaBrandt4
+from rigwake.cameras.kannala_brandt_full import KannalaBrandtFull
 from rigwake.cameras.lens import Lens
+from rigwake.cameras.mei import Mei
 from rigwake.cameras.pinhole import Pinhole, RationalPinhole
+from rigwake.cameras.scaramuzza import Scaramuzza
 from rigwake.errors import CameraError
 
 CAMERA_CLASSES: dict[str, type[Lens]] = {
-    lens.model: lens for lens in (Pinhole, RationalPinhole, KannalaBrandt4)
+    lens.model: lens
+    for lens in (
+        Pinhole,
+        RationalPinhole,
+        KannalaBrandt4,
+        KannalaBrandtFull,
+        Mei,
+        Scaramuzza,
+        EnhancedUnified,
+        DoubleSphere,
+        FieldOfView,
+    )
 }
 
 

@@ -18,6 +18,7 @@ from rigwake.cameras.kernels import (
     increasing_root,
     odd_polynomial,
     ray_at_angle,
+    scale_slopes,
     scale_to_pixel,
 )
 from rigwake.cameras.lens import Lens
@@ -32,13 +33,13 @@ def _project_point(
     n2 = q + z * z
     if q < 1e-30 * n2:
         scale_to_pixel(x, y, 1.0 / z, 0.0, -1.0 / (z * z), p, pixel, d_point, d_params)
+        d_params[:, 4:] = 0.0
         return
     rho = sqrt(q)
     theta = atan2(rho, z)
     radius, slope = odd_polynomial(p[4:], theta)
-    s = radius / rho
-    # d theta / d rho = z / n2, d theta / d z = -rho / n2
-    scale_to_pixel(x, y, s, 0.5 * (slope * z / n2 - s) / q, -slope / n2, p, pixel, d_point, d_params)
+    s, s_q, s_z = scale_slopes(radius, slope * z / n2, -slope * rho / n2, rho)
+    scale_to_pixel(x, y, s, s_q, s_z, p, pixel, d_point, d_params)
     t2 = theta * theta
     power = theta * t2 / rho
     for i in range(4, len(p)):
@@ -73,6 +74,11 @@ class KannalaBrandt4(Lens):
     def param_names(self) -> tuple[str, ...]:
         """fx, fy, cx, cy (pixels), k1..k4."""
         return ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+
+    @classmethod
+    def nominal_values(cls, focal_px: float, cx: float, cy: float) -> tuple[float, ...]:
+        """The equidistant lens."""
+        return (focal_px, focal_px, cx, cy, 0.0, 0.0, 0.0, 0.0)
 
     def _slope(self, angles: Array) -> Array:
         squares = angles * angles

@@ -66,8 +66,9 @@ def build_kernels(project_point: Callable[..., None], unproject_point: Callable[
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
             norm = sqrt(x * x + y * y + z * z)
             inside = isfinite(norm) and norm > 0.0 and z >= cos_max * norm
-            valid[i] = inside and (z > 0.0 or x != 0.0 or y != 0.0)
-            if valid[i]:
+            ok = inside and (z > 0.0 or x != 0.0 or y != 0.0)
+            valid[i] = ok
+            if ok:
                 j = i * keep
                 project_point(x, y, z, params, scratch, pixels[i], d_point[j], d_params[j])
                 continue
@@ -150,17 +151,38 @@ def scale_to_pixel(
 ) -> None:  # fmt: skip
     """Pixel `(fx s x + cx, fy s y + cy)` of a radially symmetric lens with params `fx, fy, cx, cy, ...`.
 
-    s: the scale; s_q, s_z: its derivatives by `x^2 + y^2` and by z. d_params is cleared and its first four
-    columns filled.
+    s: the scale; s_q, s_z: its derivatives by `x^2 + y^2` and by z. The first four columns of d_params are
+    filled.
     """
     fx, fy = params[0], params[1]
     pixel[0], pixel[1] = fx * s * x + params[2], fy * s * y + params[3]
     d_point[0, 0], d_point[0, 1] = fx * (s + 2.0 * x * x * s_q), fx * 2.0 * x * y * s_q
     d_point[1, 0], d_point[1, 1] = fy * 2.0 * x * y * s_q, fy * (s + 2.0 * y * y * s_q)
     d_point[0, 2], d_point[1, 2] = fx * x * s_z, fy * y * s_z
-    d_params[:] = 0.0
-    d_params[0, 0], d_params[1, 1] = s * x, s * y
-    d_params[0, 2], d_params[1, 3] = 1.0, 1.0
+    d_params[0, 0], d_params[0, 1], d_params[0, 2], d_params[0, 3] = s * x, 0.0, 1.0, 0.0
+    d_params[1, 0], d_params[1, 1], d_params[1, 2], d_params[1, 3] = 0.0, s * y, 0.0, 1.0
+
+
+@register_jitable
+def scale_slopes(radius: float, by_rho: float, by_z: float, rho: float) -> tuple[float, float, float]:
+    """The scale `s = radius / rho` and its derivatives by `rho^2` and z, from those of the radius."""
+    s = radius / rho
+    return s, 0.5 * (by_rho - s) / (rho * rho), by_z / rho
+
+
+@register_jitable
+def quotient_to_pixel(
+    x: float, y: float, below: float, by_q: float, by_z: float, by_params: Array, params: Array,
+    pixel: Array, d_point: Array, d_params: Array,
+) -> None:  # fmt: skip
+    """As `scale_to_pixel` for `s = 1 / below`, from the derivatives of `below` by `x^2 + y^2`, by z, and by
+    the parameters after the first four."""
+    s = 1.0 / below
+    s2 = s * s
+    scale_to_pixel(x, y, s, -s2 * by_q, -s2 * by_z, params, pixel, d_point, d_params)
+    for i in range(len(by_params)):
+        d_params[0, 4 + i] = -s2 * by_params[i] * params[0] * x
+        d_params[1, 4 + i] = -s2 * by_params[i] * params[1] * y
 
 
 @register_jitable

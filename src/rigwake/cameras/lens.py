@@ -14,7 +14,9 @@ from rigwake.cameras.kernels import Kernels
 from rigwake.errors import CameraError
 from rigwake.geometry.so3 import Array
 
-_FLATTEST_SLOPE = 1e-2  # a radius that grows slower than this, relative to the axis, has reached its fold
+FLATTEST_SLOPE = 1e-2  # a radius that grows slower than this, relative to the axis, has reached its fold
+_SMALLEST_DIVISOR = 1e-2
+_FOCAL = ("fx", "fy", "mu", "mv")
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,8 @@ class Lens:
 
     angle_limit: where the lens ends (half its field of view, radians), if that is known; otherwise the model
     holds as far as its radius grows with the angle.
+    bounds: what values a parameter may take. fixed_by_default: parameters that calibration and fitting leave
+    at their starting values unless asked, because boards hardly determine them.
 
     Raises CameraError for a wrong number of parameters, values that are not finite, focal lengths that are
     not positive, image sizes below one pixel, and an angle limit beyond what the parameters can represent.
@@ -30,6 +34,7 @@ class Lens:
 
     model: ClassVar[str]
     angle_ceiling: ClassVar[float] = np.pi
+    bounds: ClassVar[dict[str, tuple[float, float]]] = {}
     fixed_by_default: ClassVar[tuple[str, ...]] = ()
     kernels: ClassVar[Kernels]
 
@@ -42,7 +47,7 @@ class Lens:
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", tuple(float(value) for value in self.values))
         self._check_values()
-        determined = monotonic_limit(self._slope, self.angle_ceiling)
+        determined = self._determined_angle()
         if self.angle_limit is not None:
             if not 0.0 < self.angle_limit <= determined + 1e-9:
                 raise CameraError(
@@ -63,11 +68,10 @@ class Lens:
             )
         if not np.isfinite(self.values).all():
             raise CameraError(f"{self.model}: parameters must be finite, got {self.values}.")
-        flat = [
-            n for n, v in zip(names, self.values, strict=True) if n in ("fx", "fy", "mu", "mv") and v <= 0
-        ]
-        if flat:
-            raise CameraError(f"{self.model}: {', '.join(flat)} must be positive.")
+        for name, value in zip(names, self.values, strict=True):
+            low, high = (1e-9, np.inf) if name in _FOCAL else self.bounds.get(name, (-np.inf, np.inf))
+            if not low <= value <= high:
+                raise CameraError(f"{self.model}: {name} = {value:g} is not between {low:g} and {high:g}.")
         if self.width_px < 1 or self.height_px < 1:
             raise CameraError(f"{self.model}: the image is {self.width_px} x {self.height_px} pixels.")
 
@@ -75,6 +79,20 @@ class Lens:
         """Growth of the (radially symmetric part of the) image radius at angles (N,) off the axis, up to a
         positive factor. Where it vanishes the lens folds over."""
         raise NotImplementedError
+
+    @classmethod
+    def nominal_values(cls, focal_px: float, cx: float, cy: float) -> tuple[float, ...]:
+        """Values of an undistorted lens whose radius grows by `focal_px` per radian at the axis, centred at
+        pixel (cx, cy): where fits and calibrations start."""
+        raise NotImplementedError
+
+    def _determined_angle(self) -> float:
+        """How far the parameters can represent angles off the axis."""
+        return monotonic_limit(self._slope, self.angle_ceiling)
+
+    def _kernel_params(self) -> Array:
+        """What the compiled loops are given: the parameters, and any constants that follow from them."""
+        return self.params
 
     @property
     def param_names(self) -> tuple[str, ...]:
@@ -108,14 +126,16 @@ class Lens:
         n, rows = len(points), len(points) if keep else 1
         d_point, d_params = np.empty((rows, 2, 3)), np.empty((rows, 2, len(self.values)))
         pixels, valid = np.empty((n, 2)), np.empty(n, dtype=np.bool_)
-        self.kernels.project(points, self.params, self.max_angle, int(keep), pixels, valid, d_point, d_params)
+        self.kernels.project(
+            points, self._kernel_params(), self.max_angle, int(keep), pixels, valid, d_point, d_params
+        )
         return Projection(pixels, valid, d_point, d_params)
 
     def unproject(self, pixels: ArrayLike) -> tuple[Array, Mask]:
         """Unit bearings (N, 3), NaN where not valid, and validity (N,) of pixels (N, 2)."""
         points = _rows(pixels, 2, "pixels")
         bearings, valid = np.empty((len(points), 3)), np.empty(len(points), dtype=np.bool_)
-        self.kernels.unproject(points, self.params, self.max_angle, bearings, valid)
+        self.kernels.unproject(points, self._kernel_params(), self.max_angle, bearings, valid)
         return bearings, valid
 
 
@@ -124,6 +144,14 @@ def _rows(values: ArrayLike, columns: int, name: str) -> Array:
     if rows.ndim != 2 or rows.shape[1] != columns:
         raise CameraError(f"{name} must have shape (N, {columns}), got {rows.shape}.")
     return rows
+
+
+def quotient_slope(angles: Array, below: Array, below_slope: Array) -> Array:
+    """Derivative of the radius `sin(angle) / below` of a lens that divides, zero from where `below` has all
+    but vanished: there pixels run off to infinity. `below` is 1 on the axis."""
+    held = below > _SMALLEST_DIVISOR
+    safe = np.where(held, below, 1.0)
+    return np.asarray(np.where(held, (np.cos(angles) * below - np.sin(angles) * below_slope) / safe**2, 0.0))
 
 
 def monotonic_limit(slope: Callable[[Array], Array], ceiling: float) -> float:
@@ -139,7 +167,7 @@ def monotonic_limit(slope: Callable[[Array], Array], ceiling: float) -> float:
     for _ in range(2):
         angles = np.linspace(low, high, 513)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            folded = np.flatnonzero(~(slope(angles) > _FLATTEST_SLOPE * at_axis))
+            folded = np.flatnonzero(~(slope(angles) > FLATTEST_SLOPE * at_axis))
         if not len(folded):
             return high
         low, high = angles[max(folded[0] - 1, 0)], angles[folded[0]]

@@ -55,11 +55,17 @@ class Pinhole(Lens):
     angle_ceiling: ClassVar[float] = float(np.deg2rad(89.9))
     fixed_by_default: ClassVar[tuple[str, ...]] = ("skew", "k3")
     kernels = build_kernels(_project_point, _unproject_point)
+    _names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", "skew", "k1", "k2", "p1", "p2", "k3")
 
     @property
     def param_names(self) -> tuple[str, ...]:
-        """fx, fy, cx, cy, skew (pixels), k1, k2, p1, p2, k3."""
-        return ("fx", "fy", "cx", "cy", "skew", "k1", "k2", "p1", "p2", "k3")
+        """fx, fy, cx, cy, skew (pixels), k1, k2, p1, p2, k3 and, if rational, k4, k5, k6."""
+        return self._names
+
+    @classmethod
+    def nominal_values(cls, focal_px: float, cx: float, cy: float) -> tuple[float, ...]:
+        """The ideal pinhole."""
+        return (focal_px, focal_px, cx, cy, *[0.0] * (len(cls._names) - 4))
 
     def _slope(self, angles: Array) -> Array:
         return radial_slope(self.params[5:], np.tan(angles))
@@ -72,7 +78,4 @@ class RationalPinhole(Pinhole):
     model: ClassVar[str] = "rational"
     fixed_by_default: ClassVar[tuple[str, ...]] = ("skew",)
 
-    @property
-    def param_names(self) -> tuple[str, ...]:
-        """fx, fy, cx, cy, skew (pixels), k1, k2, p1, p2, k3, k4, k5, k6."""
-        return ("fx", "fy", "cx", "cy", "skew", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    _names: ClassVar[tuple[str, ...]] = (*Pinhole._names, "k4", "k5", "k6")

@@ -1,7 +1,7 @@
 """ROS `sensor_msgs/CameraInfo` and camera models.
 
-K is `[fx, skew, cx; 0, fy, cy; 0, 0, 1]`, row by row; R and P (rectification) are not part of the lens and are
-ignored. The distortion models are those of `sensor_msgs/distortion_models.hpp`, and the names that simulators
+K is `[fx, skew, cx; 0, fy, cy; 0, 0, 1]`, row by row; R and P (rectification) are not part of the lens and
+are ignored. The distortion models are those of `sensor_msgs/distortion_models.hpp`, and the names that simulators
 and drivers use for lenses which ROS itself does not know.
 """
 
