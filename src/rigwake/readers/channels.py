@@ -89,3 +89,8 @@ def _join(group: Sequence[Channel]) -> Channel:
         log_times_ns=np.concatenate([c.log_times_ns for c in group]),
         payloads=JoinedPayloads(tuple(c.payloads for c in group), tuple(int(row) for row in first_rows)),
     )
+
+
+def standard_type_name(message_type: str) -> str:
+    """`sensor_msgs/msg/Imu`, which ROS 1 writes without the middle part."""
+    return message_type.replace("/", "/msg/") if message_type.count("/") == 1 else message_type

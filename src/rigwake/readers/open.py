@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from rigwake.errors import InputError
+from rigwake.readers.channels import BagIndex
+from rigwake.readers.mcap_file import MAGIC as MCAP_MAGIC
+from rigwake.readers.mcap_file import index_mcap
 from rigwake.readers.ros import recording_from_bag
 from rigwake.readers.rosbag1 import MAGIC as ROSBAG1_MAGIC
 from rigwake.readers.rosbag1 import index_rosbag1
+from rigwake.readers.rosbag2 import METADATA, SQLITE_MAGIC, index_rosbag2_folder, index_sqlite
 from rigwake.readers.topics import TopicMap
 from rigwake.recording import Recording
+
+_BAGS: tuple[tuple[bytes, Callable[[Path], BagIndex]], ...] = (
+    (ROSBAG1_MAGIC, index_rosbag1),
+    (MCAP_MAGIC, index_mcap),
+    (SQLITE_MAGIC, index_sqlite),
+)
 
 
 def open_recording(path: Path | str, topics: TopicMap | None = None) -> Recording:
@@ -22,10 +33,26 @@ def open_recording(path: Path | str, topics: TopicMap | None = None) -> Recordin
     if not path.exists():
         raise InputError(f"There is no {path}.", remedy="Check the path.")
     try:
-        with path.open("rb") as file:
-            start = file.read(64)
-        if start.startswith(ROSBAG1_MAGIC):
-            return recording_from_bag(path, index_rosbag1(path), topics or TopicMap())
+        bag = _bag_index(path)
+        if bag is not None:
+            return recording_from_bag(path, bag, topics or TopicMap())
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    raise InputError(f"{path} is not a recording that rigwake knows.")
+    raise InputError(f"{path} is not a recording that rigwake knows.", remedy=_KNOWN)
+
+
+_KNOWN = (
+    "Known are ROS 1 bags, ROS 2 bags (sqlite3, MCAP), EuRoC/ASL and KITTI folders, folders of images or "
+    "videos with csv files, and NMEA logs."
+)
+
+
+def _bag_index(path: Path) -> BagIndex | None:
+    if path.is_dir():
+        return index_rosbag2_folder(path) if (path / METADATA).is_file() else None
+    with path.open("rb") as file:
+        start = file.read(64)
+    for magic, index in _BAGS:
+        if start.startswith(magic):
+            return index(path)
+    return None

@@ -16,6 +16,7 @@ from rigwake.readers.images import ImageSize
 from rigwake.readers.ros_frames import COMPRESSED, IMAGE_TYPES, RosFrames, first_image_size
 from rigwake.readers.ros_messages import decode_all, has_standard_type, stamped_rows
 from rigwake.readers.ros_sensors import FIX, IMU, POSE_TYPES, read_fix, read_imu, read_poses
+from rigwake.readers.ros_transforms import TF_TYPES, read_moving, read_static
 from rigwake.readers.streams import time_order
 from rigwake.readers.topics import TopicMap, camera_base, sensor_names
 from rigwake.recording import (
@@ -62,6 +63,7 @@ def recording_from_bag(path: Path, bag: BagIndex, topics: TopicMap) -> Recording
         "gnss": lambda name, channel: _add_fix(name, channel, found),
         "pose": lambda name, channel: _add_poses(name, channel, found),
     }
+    _add_transforms(list(usable.values()), found)
     for role, add in readers.items():
         for name, channel in _channels_of(role, usable, topics).items():
             try:
@@ -178,6 +180,15 @@ def _add_imu(name: str, channel: Channel, found: _Found) -> None:
 def _add_fix(name: str, channel: Channel, found: _Found) -> None:
     found.gnss[name], findings = read_fix(name, channel)
     found.findings += findings
+
+
+def _add_transforms(channels: Sequence[Channel], found: _Found) -> None:
+    static = [c for c in channels if c.message_type in TF_TYPES and c.topic.endswith("tf_static")]
+    moving = [c for c in channels if c.message_type in TF_TYPES and not c.topic.endswith("tf_static")]
+    transforms, findings = read_static(static)
+    found.poses, never_moving, moving_findings = read_moving(moving)
+    found.static_transforms = never_moving | transforms
+    found.findings += [*findings, *moving_findings]
 
 
 def _add_poses(name: str, channel: Channel, found: _Found) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake.errors import InputError
-from rigwake.readers.channels import BagIndex, Channel, joined
+from rigwake.readers.channels import BagIndex, Channel, joined, standard_type_name
 from rigwake.readers.chunks import Chunk, ChunkedPayloads, read_chunk
 from rigwake.recording import Finding
 
@@ -200,6 +200,6 @@ def _channels(path: Path, scan: _Scan) -> list[Channel]:
             path, "ros1", tuple(scan.chunks), chunk_rows, entries["offset"].astype(np.int64)
         )
         stamps = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
-        full_type = message_type if "/msg/" in message_type else message_type.replace("/", "/msg/", 1)
-        channels.append(Channel(topic, full_type, "ros1", stamps, payloads, digest))
+        type_name = standard_type_name(message_type)
+        channels.append(Channel(topic, type_name, "ros1", stamps, payloads, digest))
     return channels

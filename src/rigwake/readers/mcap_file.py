@@ -1,0 +1,210 @@
+"""Index of an MCAP file (ROS 1 or ROS 2 profile), read in one pass over its record headers.
+
+The pass does not need the summary at the end, so a file that was never closed, or was cut off, yields what it
+still holds. Format: https://mcap.dev/spec
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigwake.errors import InputError
+from rigwake.readers.channels import (
+    MAX_MESSAGE_BYTES,
+    BagIndex,
+    Channel,
+    Encoding,
+    joined,
+    standard_type_name,
+)
+from rigwake.readers.chunks import Chunk, ChunkedPayloads, read_chunk
+from rigwake.recording import Finding
+
+MAGIC = b"\x89MCAP0\r\n"
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
+_ENCODINGS: dict[str, Encoding] = {"ros1": "ros1", "cdr": "cdr"}
+_COMPRESSIONS = {"": "none", "lz4": "lz4", "zstd": "zstd"}
+_ENTRY = np.dtype([("time", "<u8"), ("offset", "<u8")])
+_MAX_SMALL_RECORD = 2**24  # schemas, channels and indices; messages and chunks are not read whole
+
+
+class _ChannelRecord(NamedTuple):
+    schema_id: int
+    topic: str
+    encoding: str
+
+
+@dataclass
+class _Scan:
+    """What the pass has gathered so far; messages outside chunks belong to one chunk that is the file."""
+
+    chunks: list[Chunk] = field(default_factory=list)
+    schemas: dict[int, str] = field(default_factory=dict)
+    channels: dict[int, _ChannelRecord] = field(default_factory=dict)
+    entries: dict[int, list[tuple[int, NDArray[np.void]]]] = field(default_factory=dict)
+    indexed_chunks: set[int] = field(default_factory=set)
+    loose: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+
+def index_mcap(path: Path) -> BagIndex:
+    """Index an MCAP file; damage is reported in `findings`. InputError if it is no MCAP file."""
+    file = os.open(path, os.O_RDONLY)
+    try:
+        if os.pread(file, len(MAGIC), 0) != MAGIC:
+            raise InputError(f"{path.name} is not an MCAP file.")
+        file_bytes = os.fstat(file).st_size
+        scan = _Scan()
+        _scan_records(file, file_bytes, scan)
+        _complete_from_chunks(file, scan)
+    finally:
+        os.close(file)
+    scan.chunks.append(Chunk(0, file_bytes, file_bytes, "none"))
+    for channel, loose in scan.loose.items():
+        entry = (len(scan.chunks) - 1, np.array(loose, _ENTRY))
+        scan.entries.setdefault(channel, []).append(entry)
+    channels, foreign = _channels(path, scan)
+    findings = [Finding("error", "", f"{problem}; what could be read is kept.") for problem in scan.problems]
+    return BagIndex("mcap", joined(channels), (*findings, *foreign))
+
+
+def _scan_records(file: int, file_bytes: int, scan: _Scan) -> None:
+    position, operation = len(MAGIC), 0
+    while position < file_bytes and operation != _FOOTER:
+        try:
+            start = os.pread(file, 64, position)
+            operation, content_bytes = _record_head(start)
+            content = position + 9
+            if content + content_bytes > file_bytes:
+                if operation == _CHUNK:
+                    _add_chunk(start[9:], content, file_bytes - content, scan)
+                raise InputError("a record runs past the end of the file")
+            if operation == _CHUNK:
+                _add_chunk(start[9:], content, content_bytes, scan)
+            elif operation == _MESSAGE:
+                _add_loose(start[9:], position, scan.loose)
+            elif operation in (_SCHEMA, _CHANNEL, _MESSAGE_INDEX):
+                if content_bytes > _MAX_SMALL_RECORD:
+                    raise InputError(f"a record claims {content_bytes} bytes")
+                _add_small(operation, os.pread(file, content_bytes, content), scan)
+        except InputError as error:
+            scan.problems.append(f"The file is cut off or damaged at byte {position} ({error.cause})")
+            return
+        position = content + content_bytes
+    if operation != _FOOTER:
+        scan.problems.append("The file has no footer: it was not closed")
+
+
+def _record_head(start: bytes) -> tuple[int, int]:
+    if len(start) < 9:
+        raise InputError("a record is cut off")
+    operation, content_bytes = struct.unpack_from("<BQ", start)
+    if operation == 0:
+        raise InputError("a record has no type")
+    return operation, content_bytes
+
+
+def _add_chunk(start: bytes, content: int, stored_bytes: int, scan: _Scan) -> None:
+    # start time, end time, unpacked size, crc, compression (string), packed size, records
+    if len(start) < 32:
+        raise InputError("a chunk is cut off")
+    unpacked, _, name_bytes = struct.unpack_from("<QII", start, 16)
+    if name_bytes > 8 or 40 + name_bytes > len(start):
+        raise InputError("a chunk header is damaged")
+    name = start[32 : 32 + name_bytes].decode("ascii", "replace")
+    head = 40 + name_bytes
+    compression = _COMPRESSIONS.get(name, name)
+    if compression == "none":
+        unpacked = min(unpacked, stored_bytes - head)
+    scan.chunks.append(Chunk(content + head, stored_bytes - head, unpacked, compression))
+
+
+def _add_loose(start: bytes, position: int, loose: dict[int, list[tuple[int, int]]]) -> None:
+    if len(start) < 22:
+        raise InputError("a message is cut off")
+    channel, _, log_time = struct.unpack_from("<HIQ", start)
+    loose.setdefault(channel, []).append((log_time, position))
+
+
+def _add_small(operation: int, content: bytes, scan: _Scan) -> None:
+    try:
+        (number,) = struct.unpack_from("<H", content)
+        if operation == _SCHEMA:
+            scan.schemas[number] = _string(content, 2)[0]
+        elif operation == _CHANNEL:
+            (schema_id,) = struct.unpack_from("<H", content, 2)
+            topic, end = _string(content, 4)
+            scan.channels[number] = _ChannelRecord(schema_id, topic, _string(content, end)[0])
+        else:
+            (index_bytes,) = struct.unpack_from("<I", content, 2)
+            if not scan.chunks or 6 + index_bytes != len(content) or index_bytes % _ENTRY.itemsize:
+                raise InputError("a message index is damaged")
+            entries = np.frombuffer(content, _ENTRY, offset=6)
+            scan.entries.setdefault(number, []).append((len(scan.chunks) - 1, entries))
+            scan.indexed_chunks.add(len(scan.chunks) - 1)
+    except struct.error as error:
+        raise InputError("a record is cut off") from error
+
+
+def _string(content: bytes, at: int) -> tuple[str, int]:
+    (size,) = struct.unpack_from("<I", content, at)
+    if at + 4 + size > len(content):
+        raise InputError("a text runs past the end of its record")
+    return content[at + 4 : at + 4 + size].decode("utf-8", "replace"), at + 4 + size
+
+
+def _complete_from_chunks(file: int, scan: _Scan) -> None:
+    """Walk through chunks that have no index, and those that hold channels not yet known."""
+    unknown = {rows[0][0] for channel, rows in scan.entries.items() if channel not in scan.channels}
+    for chunk_row in sorted((set(range(len(scan.chunks))) - scan.indexed_chunks) | unknown):
+        try:
+            _walk_chunk(read_chunk(file, scan.chunks[chunk_row]), chunk_row, scan)
+        except InputError as error:
+            scan.problems.append(f"Chunk {chunk_row} is lost ({error.cause})")
+
+
+def _walk_chunk(content: bytes, chunk_row: int, scan: _Scan) -> None:
+    found: dict[int, list[tuple[int, int]]] = {}
+    at = 0
+    while at < len(content):
+        try:
+            operation, record_bytes = _record_head(content[at : at + 9])
+            end = at + 9 + record_bytes
+            if end > len(content) or record_bytes > MAX_MESSAGE_BYTES:
+                break  # the message that was being written when the file was cut
+            if operation in (_SCHEMA, _CHANNEL):
+                _add_small(operation, content[at + 9 : end], scan)
+            elif operation == _MESSAGE:
+                _add_loose(content[at + 9 : at + 31], at, found)
+        except InputError:
+            break
+        at = end
+    if chunk_row not in scan.indexed_chunks:
+        for channel, entries in found.items():
+            scan.entries.setdefault(channel, []).append((chunk_row, np.array(entries, _ENTRY)))
+
+
+def _channels(path: Path, scan: _Scan) -> tuple[list[Channel], list[Finding]]:
+    channels, foreign = [], []
+    for number, (schema_id, topic, encoding_name) in scan.channels.items():
+        encoding = _ENCODINGS.get(encoding_name)
+        if encoding is None:
+            message = f"{topic}: messages are encoded as {encoding_name!r}, not as ROS messages; left out."
+            foreign.append(Finding("note", topic, message))
+            continue
+        parts = sorted(scan.entries.get(number, []), key=lambda part: part[0])
+        entries = np.concatenate([np.empty(0, _ENTRY), *(part for _, part in parts)])
+        chunk_rows = np.repeat([row for row, _ in parts], [len(part) for _, part in parts]).astype(np.int32)
+        offsets = np.minimum(entries["offset"], 2**62).astype(np.int64)  # a damaged one points nowhere
+        payloads = ChunkedPayloads(path, "mcap", tuple(scan.chunks), chunk_rows, offsets)
+        stamps = np.minimum(entries["time"], 2**62).astype(np.int64)
+        message_type = standard_type_name(scan.schemas.get(schema_id, ""))
+        channels.append(Channel(topic, message_type, encoding, stamps, payloads))
+    return channels, foreign

@@ -1,0 +1,47 @@
+"""`write_recording`: a recording in any format that rigwake writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, get_args
+
+from rigwake.errors import UsageError
+from rigwake.recording import Finding, Recording
+from rigwake.writers.rosbag import ImageEncoding, write_rosbag1, write_rosbag2
+
+RecordingFormat = Literal["ros1", "ros2", "mcap", "euroc", "folder"]
+
+
+def format_of_path(path: Path) -> RecordingFormat:
+    """`.bag` is a ROS 1 bag, `.mcap` a ROS 2 MCAP file, anything else a plain folder."""
+    return {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix, "folder")  # type: ignore[return-value]
+
+
+def write_recording(
+    recording: Recording,
+    path: Path | str,
+    *,
+    file_format: RecordingFormat | None = None,
+    image_encoding: ImageEncoding = "jpeg",
+) -> tuple[Finding, ...]:
+    """Write a recording, streaming its images; it is whole or not there.
+
+    file_format: `ros1` (bag), `ros2` (folder with sqlite3), `mcap` (a file if the path ends in `.mcap`, else
+    a ROS 2 folder), `euroc`, `folder`; by default as the path's suffix says. image_encoding: `jpeg` loses a
+    little, `png` and `raw` nothing; folders cannot hold `raw`. Returns findings about what the format cannot
+    hold. Raises UsageError for an unknown format or a path that is in the way.
+    """
+    path = Path(path)
+    chosen = file_format or format_of_path(path)
+    if image_encoding not in get_args(ImageEncoding):
+        raise UsageError(f"Image encoding {image_encoding!r} is not one of jpeg, png, raw.")
+    match chosen:
+        case "ros1":
+            return write_rosbag1(recording, path, image_encoding)
+        case "ros2":
+            return write_rosbag2(recording, path, image_encoding, "sqlite3")
+        case "mcap":
+            return write_rosbag2(recording, path, image_encoding, "mcap")
+    raise UsageError(
+        f"{chosen!r} is no format of recordings.", remedy=f"Choose one of {get_args(RecordingFormat)}."
+    )
