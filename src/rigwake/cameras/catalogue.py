@@ -36,6 +36,15 @@ CAMERA_CLASSES: dict[str, type[Lens]] = {
 }
 
 
+def camera_class(model: str) -> type[Lens]:
+    """The class of this model name; CameraError lists the known ones."""
+    if model not in CAMERA_CLASSES:
+        raise CameraError(
+            f"There is no camera model {model!r}.", remedy=f"Known: {', '.join(sorted(CAMERA_CLASSES))}."
+        )
+    return CAMERA_CLASSES[model]
+
+
 def camera_from_params(
     model: str, params: ArrayLike, width_px: int, height_px: int, max_angle: float | None = None
 ) -> CameraModel:
@@ -44,12 +53,8 @@ def camera_from_params(
     max_angle: where the lens ends (half its field of view, radians), if known. CameraError for an unknown
     name, or values that the model refuses.
     """
-    if model not in CAMERA_CLASSES:
-        raise CameraError(
-            f"There is no camera model {model!r}.", remedy=f"Known: {', '.join(sorted(CAMERA_CLASSES))}."
-        )
     values = tuple(float(value) for value in np.asarray(params, dtype=np.float64).ravel())
-    return CAMERA_CLASSES[model](values, int(width_px), int(height_px), max_angle)
+    return camera_class(model)(values, int(width_px), int(height_px), max_angle)
 
 
 def camera_to_dict(camera: CameraModel) -> dict[str, Any]:
