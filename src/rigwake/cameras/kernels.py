@@ -38,19 +38,17 @@ class Kernels:
     unproject: Callable[..., None]
 
 
-def _source_version() -> str:
-    """Digest of this package's sources: numba keys its cache by the loop's own file only, so that without
-    it an edited lens would go on running its old machine code."""
-    sources = sorted(Path(__file__).parent.glob("*.py"))
-    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
-
-
-_VERSION = _source_version()
+def _source_version(point_function: Callable[..., object]) -> str:
+    """Digest of the sources that a lens is compiled from: numba keys its cache by the loop's own file only,
+    so that without it an edited lens would go on running its old machine code."""
+    shared = Path(__file__).parent
+    sources = {shared / "kernels.py", shared / "brown.py", Path(point_function.__code__.co_filename)}
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(sources))).hexdigest()
 
 
 def build_kernels(project_point: Callable[..., None], unproject_point: Callable[..., bool]) -> Kernels:
     """Loops over points around the scalar functions of a lens; compiled on first use, cached on disk."""
-    version = _VERSION
+    version = _source_version(project_point)
 
     @njit(cache=True, nogil=True, error_model="numpy")
     def project(
