@@ -7,8 +7,12 @@ from pathlib import Path
 
 from rigwake.errors import InputError
 from rigwake.readers.channels import BagIndex
+from rigwake.readers.euroc import euroc_root, read_euroc
+from rigwake.readers.folder import is_plain_folder, read_folder
+from rigwake.readers.kitti import is_kitti_odometry, is_kitti_raw, read_kitti_odometry, read_kitti_raw
 from rigwake.readers.mcap_file import MAGIC as MCAP_MAGIC
 from rigwake.readers.mcap_file import index_mcap
+from rigwake.readers.nmea import looks_like_nmea, nmea_recording
 from rigwake.readers.ros import recording_from_bag
 from rigwake.readers.rosbag1 import MAGIC as ROSBAG1_MAGIC
 from rigwake.readers.rosbag1 import index_rosbag1
@@ -20,6 +24,13 @@ _BAGS: tuple[tuple[bytes, Callable[[Path], BagIndex]], ...] = (
     (ROSBAG1_MAGIC, index_rosbag1),
     (MCAP_MAGIC, index_mcap),
     (SQLITE_MAGIC, index_sqlite),
+)
+
+_FOLDERS: tuple[tuple[Callable[[Path], object], Callable[[Path], Recording]], ...] = (
+    (euroc_root, read_euroc),
+    (is_kitti_odometry, read_kitti_odometry),
+    (is_kitti_raw, read_kitti_raw),
+    (is_plain_folder, read_folder),
 )
 
 
@@ -36,6 +47,14 @@ def open_recording(path: Path | str, topics: TopicMap | None = None) -> Recordin
         bag = _bag_index(path)
         if bag is not None:
             return recording_from_bag(path, bag, topics or TopicMap())
+        if path.is_dir():
+            for recognised, read in _FOLDERS:
+                if recognised(path):
+                    return read(path)
+        else:
+            with path.open("rb") as file:
+                if looks_like_nmea(file.read(64)):
+                    return nmea_recording(path)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
     raise InputError(f"{path} is not a recording that rigwake knows.", remedy=_KNOWN)

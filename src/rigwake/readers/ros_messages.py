@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from rigwake.errors import InputError
@@ -28,7 +28,11 @@ HEADER_BYTES = 256
 @cache
 def typestore(encoding: Encoding) -> Typestore:
     """The standard message definitions for this encoding."""
-    return get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
+        if name not in store.fielddefs:
+            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", name))
+    return store
 
 
 def has_standard_type(channel: Channel) -> bool:

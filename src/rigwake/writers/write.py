@@ -7,6 +7,8 @@ from typing import Literal, get_args
 
 from rigwake.errors import UsageError
 from rigwake.recording import Finding, Recording
+from rigwake.writers.euroc import write_euroc
+from rigwake.writers.folders import write_folder
 from rigwake.writers.rosbag import ImageEncoding, write_rosbag1, write_rosbag2
 
 RecordingFormat = Literal["ros1", "ros2", "mcap", "euroc", "folder"]
@@ -42,6 +44,10 @@ def write_recording(
             return write_rosbag2(recording, path, image_encoding, "sqlite3")
         case "mcap":
             return write_rosbag2(recording, path, image_encoding, "mcap")
+        case "euroc":
+            return write_euroc(recording, path)
+        case "folder":
+            return write_folder(recording, path, image_encoding)
     raise UsageError(
         f"{chosen!r} is no format of recordings.", remedy=f"Choose one of {get_args(RecordingFormat)}."
     )

@@ -1,0 +1,92 @@
+"""`rig.yaml`: the cameras of a folder, their lenses and, where known, where they sit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from rigwake.cameras.base import CameraModel
+from rigwake.cameras.catalogue import camera_from_dict
+from rigwake.errors import CameraError, InputError
+from rigwake.geometry.se3 import SE3
+from rigwake.rig import Rig, RigCamera
+
+_MAX_BYTES = 2**22
+
+
+def read_yaml_mapping(path: Path) -> dict[str, Any]:
+    """A YAML file that holds a mapping; the `%YAML:1.0` line of OpenCV is accepted. InputError otherwise."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise InputError(f"{path} is too large for a settings file.")
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        content = yaml.safe_load("\n".join(line for line in lines if not line.startswith("%")))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as YAML ({error}).") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path} does not hold named settings.")
+    return content
+
+
+def rigid_transform(matrix: Any, where: str) -> SE3:
+    """A transform from 16 (or 12) numbers, checked to be rigid and made exactly so. InputError otherwise."""
+    try:
+        values = np.array(matrix, dtype=np.float64).reshape(-1, 4)[:3]
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where} is not a 4 x 4 matrix.") from error
+    R = values[:, :3] if values.shape == (3, 4) else np.zeros((3, 3))
+    if not np.isfinite(values).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise InputError(f"{where} is not a rigid transform.")
+    return SE3.from_matrix(values).normalised()
+
+
+def read_rig_file(path: Path) -> tuple[dict[str, CameraModel], Rig | None]:
+    """Lenses by camera name, and the rig if the file says where every camera sits.
+
+    Keys: `reference`, `cameras.NAME.camera` (a lens), `cameras.NAME.rig_from_cam` (`quat_wxyz`,
+    `translation_m`), `cameras.NAME.time_offset_s`, `antenna_rig_m`, `rig_from_imu`. Raises InputError.
+    """
+    content = read_yaml_mapping(path)
+    try:
+        described = {str(name): dict(entry or {}) for name, entry in dict(content["cameras"]).items()}
+        models = {n: camera_from_dict(e["camera"]) for n, e in described.items() if e.get("camera")}
+        if not described or not all("rig_from_cam" in entry for entry in described.values()):
+            return models, None
+        cameras = {
+            name: RigCamera(
+                name,
+                _transform(entry["rig_from_cam"]),
+                models.get(name),
+                float(entry.get("time_offset_s") or 0.0),
+                str(entry.get("topic") or ""),
+            )
+            for name, entry in described.items()
+        }
+        antenna, imu = content.get("antenna_rig_m"), content.get("rig_from_imu")
+        rig = Rig(
+            str(content.get("reference", "base_link")),
+            cameras,
+            None if antenna is None else _position(antenna),
+            None if imu is None else _transform(imu),
+        )
+    except (KeyError, TypeError, ValueError, CameraError) as error:
+        raise InputError(
+            f"{path} does not describe a rig ({error}).", remedy="See docs/recordings.md."
+        ) from error
+    return models, rig
+
+
+def _position(values: Any) -> tuple[float, float, float]:
+    x, y, z = np.array(values, dtype=np.float64).reshape(3).tolist()
+    return x, y, z
+
+
+def _transform(entry: Any) -> SE3:
+    quat_wxyz = np.array(entry["quat_wxyz"], dtype=np.float64).reshape(4)
+    translation = np.array(entry["translation_m"], dtype=np.float64).reshape(3)
+    if not np.isfinite([*quat_wxyz, *translation]).all() or abs(np.linalg.norm(quat_wxyz) - 1) > 1e-3:
+        raise ValueError("a transform is not finite or its quaternion not of unit length")
+    return SE3.from_quat_wxyz(quat_wxyz, translation)
