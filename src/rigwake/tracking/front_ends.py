@@ -9,21 +9,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.cameras.base import Mask
 from rigwake.errors import UsageError
 from rigwake.geometry.so3 import Array
 from rigwake.recording import CameraStream, Image
-from rigwake.tracking.features import detect_corners
-from rigwake.tracking.klt import follow
-from rigwake.tracking.masks import CameraMask, beyond_lens
+from rigwake.tracking.klt_front_end import KltFrontEnd, Observed
+from rigwake.tracking.masks import CameraMask, HorizonMask, beyond_lens
 from rigwake.tracking.options import TrackingOptions
 from rigwake.tracks import TrackingReport, Tracks
 
 _MIN_CONTRAST = 2.0  # grey levels: an image with less standard deviation shows nothing
-_MIN_STRENGTH = 400.0  # (grey levels / px)^2 over 7x7 px: 0.05 px per grey level of noise
-
-Observed = tuple[NDArray[np.int64], Array, Array]
-"""Track ids (N,), pixels (N, 2), std_px (N,) seen in one frame."""
 
 
 def track_camera(
@@ -32,6 +26,7 @@ def track_camera(
     mask: CameraMask | None = None,
     *,
     indices: NDArray[np.int64] | None = None,
+    up_cam: Array | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Tracks:
     """Follow points through the images of one camera.
@@ -52,7 +47,9 @@ def track_camera(
     if mask is not None:
         usable &= mask.usable
     chosen = np.arange(len(stream)) if indices is None else np.asarray(indices)
-    front_end = KltFrontEnd(options, usable)
+    front_end = KltFrontEnd(stream.model, options)
+    last_ns: int | None = None
+    horizon = None if up_cam is None else HorizonMask(stream.model)
     run = _Run()
     row_of_index = {int(index): row for row, index in enumerate(chosen)}
     started = time.perf_counter()
@@ -60,7 +57,13 @@ def track_camera(
         kind = run.judge(frame.image)
         if kind == "usable":
             row = row_of_index[frame.index]
-            run.add(row, front_end.step(frame.image, frame.timestamp_ns))
+            if last_ns is not None and (frame.timestamp_ns - last_ns) * 1e-9 > options.max_gap_s:
+                front_end.forget()
+            above = usable
+            if up_cam is not None and horizon is not None and np.isfinite(up_cam[row]).all():
+                above = usable & ~horizon.below(up_cam[row])
+            run.add(row, front_end.step(frame.image, above))
+            last_ns = frame.timestamp_ns
         if progress is not None:
             progress(done + 1)
     return run.tracks(stream, chosen, time.perf_counter() - started)
@@ -122,66 +125,3 @@ class _Run:
             std_px[keep],
             report,
         )
-
-
-class KltFrontEnd:
-    """Corners followed from frame to frame."""
-
-    def __init__(self, options: TrackingOptions, usable: Mask) -> None:
-        self.options = options
-        self.usable = usable
-        self.next_id = 0
-        self.ids = np.empty(0, dtype=np.int64)
-        self.pixels = np.empty((0, 2))
-        self.image: Image | None = None
-        self.timestamp_ns = 0
-
-    def step(self, image: Image, timestamp_ns: int) -> Observed:
-        """Observations in the next image."""
-        options = self.options
-        gap_s = (timestamp_ns - self.timestamp_ns) * 1e-9
-        if self.image is None or gap_s > options.max_gap_s:
-            self._forget()
-        else:
-            pixels, believed = follow(
-                self.image,
-                image,
-                self.pixels,
-                self.pixels,
-                window_px=options.window_px,
-                levels=options.levels,
-                max_forward_backward_px=options.max_forward_backward_px,
-            )
-            believed &= inside(self.usable, pixels)
-            self.ids, self.pixels = self.ids[believed], pixels[believed]
-        if len(self.ids) < options.redetect_below * options.max_features:
-            self._detect(image)
-        self.image, self.timestamp_ns = image, timestamp_ns
-        return self.ids, self.pixels, np.full(len(self.ids), 0.3)
-
-    def _forget(self) -> None:
-        self.ids, self.pixels = self.ids[:0], self.pixels[:0]
-
-    def _detect(self, image: Image) -> None:
-        corners = detect_corners(
-            image,
-            self.usable,
-            self.pixels,
-            wanted=self.options.max_features - len(self.ids),
-            cell_px=self.options.cell_px,
-            min_distance_px=self.options.min_distance_px,
-            min_strength=_MIN_STRENGTH,
-        )
-        ids = np.arange(self.next_id, self.next_id + len(corners))
-        self.next_id += len(corners)
-        self.ids = np.concatenate([self.ids, ids])
-        self.pixels = np.concatenate([self.pixels, corners])
-
-
-def inside(usable: Mask, pixels: Array) -> Mask:
-    """Which pixels (N, 2) lie on the image and where `usable` is True: (N,)."""
-    height, width = usable.shape
-    nearest = np.rint(np.nan_to_num(pixels, nan=-1.0)).astype(np.int64)
-    x, y = nearest[:, 0], nearest[:, 1]
-    on_image = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    return np.asarray(on_image & usable[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)])

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rigwake.cameras.base import CameraModel, Mask
+from rigwake.geometry.so3 import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,7 @@ class CameraMask:
         return usable
 
 
-def pixel_grid(width_px: int, height_px: int) -> np.ndarray:
+def pixel_grid(width_px: int, height_px: int) -> Array:
     """Centres of all pixels, row by row: (H * W, 2)."""
     x, y = np.meshgrid(np.arange(width_px, dtype=np.float64), np.arange(height_px, dtype=np.float64))
     return np.stack([x.ravel(), y.ravel()], axis=1)
@@ -40,4 +41,32 @@ def beyond_lens(model: CameraModel, margin: float = np.deg2rad(1.0)) -> Mask:
     """(H, W), True where no ray of the model within `max_angle - margin` lands (margin in radians)."""
     bearings, valid = model.unproject(pixel_grid(model.width_px, model.height_px))
     valid &= np.nan_to_num(bearings[:, 2], nan=-1.0) > np.cos(min(model.max_angle - margin, np.pi))
-    return ~valid.reshape(model.height_px, model.width_px)
+    return np.asarray(~valid.reshape(model.height_px, model.width_px))
+
+
+class HorizonMask:
+    """What lies below the horizon, frame by frame.
+
+    On open water that is the water, which moves: corners on it are not static points.
+    """
+
+    def __init__(self, model: CameraModel, margin: float = np.deg2rad(0.5)) -> None:
+        """margin: radians above the horizon that are left out with it, for errors of the attitude."""
+        bearings, _ = model.unproject(pixel_grid(model.width_px, model.height_px))
+        self._bearings = bearings.astype(np.float32)
+        self._shape = (model.height_px, model.width_px)
+        self._sine = np.float32(np.sin(margin))
+
+    def below(self, up_cam: Array) -> Mask:
+        """(H, W), True below the horizon; `up_cam` (3,) is the unit vector against gravity in camera axes."""
+        height = self._bearings @ up_cam.astype(np.float32)
+        return np.asarray(~(height >= self._sine).reshape(self._shape))
+
+
+def inside(usable: Mask, pixels: Array) -> Mask:
+    """Which pixels (N, 2) lie on the image and where `usable` is True: (N,)."""
+    height, width = usable.shape
+    nearest = np.rint(np.nan_to_num(pixels, nan=-1.0)).astype(np.int64)
+    x, y = nearest[:, 0], nearest[:, 1]
+    on_image = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    return np.asarray(on_image & usable[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)])

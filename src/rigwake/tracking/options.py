@@ -19,6 +19,11 @@ class TrackingOptions:
         are looked for. cell_px: side of the grid cells over which points are balanced.
     min_distance_px: spacing of points. window_px, levels: the pyramidal Lucas-Kanade search.
     max_forward_backward_px: how far a point may land from where it started when followed there and back.
+    patch_radius_px: of the reference patches that every observation is registered against.
+    warp_prior_std: how far a patch may deform otherwise than the camera's turn predicts, per frame (px per px).
+    min_correlation: with the reference patch, under which a point is lost. max_std_px: predicted standard
+        deviation of an observation, above which a point is lost. max_stretch: a patch drawn larger or smaller
+        than its reference by more ends; the point may be found anew, as another track.
     max_gap_s: points are not followed across a longer gap between usable frames.
     """
 
@@ -30,6 +35,11 @@ class TrackingOptions:
     window_px: int = 21
     levels: int = 4
     max_forward_backward_px: float = 1.0
+    patch_radius_px: int = 8
+    warp_prior_std: float = 0.02
+    min_correlation: float = 0.95
+    max_std_px: float = 0.3
+    max_stretch: float = 1.8
     max_gap_s: float = 0.6
 
     def __post_init__(self) -> None:

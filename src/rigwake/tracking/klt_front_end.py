@@ -1,0 +1,162 @@
+"""Corners followed by pyramidal Lucas-Kanade and registered against the patch they were first seen with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigwake.cameras.base import CameraModel, Mask
+from rigwake.geometry.so3 import Array
+from rigwake.recording import Image
+from rigwake.tracking.features import detect_corners
+from rigwake.tracking.interpolation import Coefficients, spline_coefficients
+from rigwake.tracking.klt import follow
+from rigwake.tracking.masks import inside
+from rigwake.tracking.options import TrackingOptions
+from rigwake.tracking.registration import PatchShape, References, make_references, register
+from rigwake.tracking.warps import dominant_rotation, rotation_warps, stencil_bearings
+
+Observed = tuple[NDArray[np.int64], Array, Array]
+"""Track ids (N,), pixels (N, 2), std_px (N,) seen in one frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Live:
+    """The N points that are being followed.
+
+    warps: affine, image from reference patch; of these `turns` is the part that the camera's rotation explains.
+    stencils, image_from_reference: bearings about the reference pixel, and the camera's rotation since.
+    """
+
+    ids: NDArray[np.int64]
+    pixels: Array
+    bearings: Array
+    std_px: Array
+    warps: Array
+    turns: Array
+    stencils: Array
+    image_from_reference: Array
+    references: References
+
+    def take(self, index: Mask) -> _Live:
+        return _Live(*(_taken(getattr(self, f.name), index) for f in fields(self)))
+
+    def join(self, other: _Live) -> _Live:
+        return _Live(*(_joined(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)))
+
+
+def _taken(value: Any, index: Mask) -> Any:
+    return value.take(index) if isinstance(value, References) else value[index]
+
+
+def _joined(first: Any, second: Any) -> Any:
+    return first.join(second) if isinstance(first, References) else np.concatenate([first, second])
+
+
+class KltFrontEnd:
+    """Follows points through consecutive images of one camera."""
+
+    def __init__(self, model: CameraModel, options: TrackingOptions) -> None:
+        self.model = model
+        self.options = options
+        self.shape = PatchShape.disc(options.patch_radius_px)
+        self.noise = 1.5  # grey levels, until registrations tell
+        self.live: _Live | None = None
+        self.image: Image | None = None
+        self.next_id = 0
+
+    def forget(self) -> None:
+        """Start anew: the next image does not continue the last one."""
+        self.live = self.image = None
+
+    def step(self, image: Image, usable: Mask) -> Observed:
+        """Observations in the next image; `usable` (H, W) says where points may be."""
+        coefficients = spline_coefficients(image)
+        live = self._continue(image, coefficients, usable)
+        if live is None or len(live.ids) < self.options.redetect_below * self.options.max_features:
+            live = self._detect(image, coefficients, usable, live)
+        self.live, self.image = live, image
+        return live.ids, live.pixels, live.std_px
+
+    def _continue(self, image: Image, coefficients: Coefficients, usable: Mask) -> _Live | None:
+        """The live points that are found in the image."""
+        live, options = self.live, self.options
+        if live is None or self.image is None or len(live.ids) == 0:
+            return None
+        predicted, believed = follow(
+            self.image,
+            image,
+            live.pixels,
+            live.pixels,
+            window_px=options.window_px,
+            levels=options.levels,
+            max_forward_backward_px=options.max_forward_backward_px,
+        )
+        bearings, valid = self.model.unproject(predicted)
+        kept = believed & valid
+        live, predicted, bearings = live.take(kept), predicted[kept], bearings[kept]
+        turned = dominant_rotation(live.bearings, bearings) @ live.image_from_reference
+        turns, valid = rotation_warps(self.model, live.stencils, turned, bearings)
+        seen = register(
+            coefficients,
+            live.references,
+            self.shape,
+            predicted,
+            # what the turn does not explain (approach, slant) is expected to stay as it was
+            turns @ np.linalg.solve(live.turns, live.warps),
+            warp_prior_std=options.warp_prior_std,
+        )
+        if seen.found.any():
+            self.noise = float(np.median(seen.noise[seen.found]))
+        bearings, on_lens = self.model.unproject(seen.pixels)
+        stretch = np.linalg.svd(seen.warps, compute_uv=False)
+        kept = valid & on_lens & seen.found & inside(usable, seen.pixels)
+        kept &= (seen.correlation >= options.min_correlation) & (seen.std_px <= options.max_std_px)
+        kept &= (stretch[:, 0] <= options.max_stretch) & (stretch[:, 1] >= 1 / options.max_stretch)
+        now = _Live(
+            live.ids,
+            seen.pixels,
+            bearings,
+            seen.std_px,
+            seen.warps,
+            turns,
+            live.stencils,
+            turned,
+            live.references,
+        )
+        return now.take(kept)
+
+    def _detect(self, image: Image, coefficients: Coefficients, usable: Mask, live: _Live | None) -> _Live:
+        """The live points and new corners."""
+        options = self.options
+        occupied = np.empty((0, 2)) if live is None else live.pixels
+        corners = detect_corners(
+            image,
+            usable,
+            occupied,
+            wanted=options.max_features - len(occupied),
+            cell_px=options.cell_px,
+            min_distance_px=options.min_distance_px,
+            min_strength=(self.noise / options.max_std_px) ** 2,
+        )
+        stencils, valid = stencil_bearings(self.model, corners)
+        bearings, on_lens = self.model.unproject(corners)
+        references, textured = make_references(coefficients, corners, self.shape)
+        n = len(corners)
+        same = np.broadcast_to(np.eye(2), (n, 2, 2))
+        new = _Live(
+            np.arange(self.next_id, self.next_id + n),
+            corners,
+            bearings,
+            self.noise * references.std_per_noise(),
+            same,
+            same,
+            stencils,
+            np.broadcast_to(np.eye(3), (n, 3, 3)),
+            references,
+        ).take(valid & on_lens & textured)
+        self.next_id += n
+        return new if live is None else live.join(new)
