@@ -13,35 +13,39 @@ from rigwake.bundle.layout import Layout
 from rigwake.bundle.motion import state_times_s
 from rigwake.bundle.normal import Factors
 from rigwake.bundle.preintegration import Preintegrated, imu_noise, preintegrate
-from rigwake.bundle.problem import RigProblem
+from rigwake.bundle.problem import Indices, RigProblem
 from rigwake.geometry import so3
 from rigwake.geometry.so3 import Array
 
 
 def inertial_factors(problem: RigProblem, layout: Layout) -> Factors:
     """One factor of 15 rows `[rotation, velocity, position, gyro bias, accel bias]` per pair of neighbours."""
+    residuals, jacobian, columns, covariance = inertial_rows(problem, layout)
+    whiten = whitening(covariance)
+    r = np.einsum("nij,nj->ni", whiten, residuals)
+    return Factors(r, whiten @ jacobian, columns, 0.5 * float(np.sum(r * r)))
+
+
+def inertial_rows(problem: RigProblem, layout: Layout) -> tuple[Array, Array, Indices, Array]:
+    """Unwhitened residuals (n, 15), derivatives (n, 15, 33) by columns (n, 33), and covariances (n, 15, 15)."""
     values, times = problem.states.inertial, state_times_s(problem)
     assert problem.imu is not None
     assert values is not None
-    earlier = np.arange(len(times) - 1)
+    earlier, dt = np.arange(len(times) - 1), np.diff(times)
     moved = preintegrate(problem, times[:-1], times[1:], earlier)
-    dt = np.diff(times)
     residuals, jacobian = _motion_rows(problem, values.velocity_world, moved, dt)
-    for row, bias in ((9, values.gyro_bias), (12, values.accel_bias)):
-        residuals[:, row : row + 3] = np.diff(bias, axis=0)
-        jacobian[:, row : row + 3, row : row + 3] = -np.eye(3)
-        jacobian[:, row : row + 3, 15 + row : 18 + row] = np.eye(3)
-    whiten = np.zeros((len(dt), 15, 15))
-    whiten[:, :9, :9] = whitening(moved.covariance)
-    noise = imu_noise(problem.imu)
-    for row, walk in ((9, noise.gyro_walk), (12, noise.accel_walk)):
-        whiten[:, row : row + 3, row : row + 3] = np.eye(3) / (walk * np.sqrt(dt))[:, None, None]
-    r = np.einsum("nij,nj->ni", whiten, residuals)
+    noise, covariance = imu_noise(problem.imu), np.zeros((len(dt), 15, 15))
+    covariance[:, :9, :9] = moved.covariance
+    biases = ((9, values.gyro_bias, noise.gyro_walk), (12, values.accel_bias, noise.accel_walk))
+    for row, bias, walk in biases:
+        rows = slice(row, row + 3)
+        residuals[:, rows] = np.diff(bias, axis=0)
+        jacobian[:, rows, rows] = -np.eye(3)
+        jacobian[:, rows, row + 15 : row + 18] = np.eye(3)
+        covariance[:, rows, rows] = np.eye(3) * walk**2 * dt[:, None, None]
     gravity = np.broadcast_to(layout.shared_columns("gravity", "acceleration_world", 3), (len(dt), 3))
-    columns = np.concatenate(
-        [layout.state_columns(earlier, 15), layout.state_columns(earlier + 1, 15), gravity], axis=1
-    )
-    return Factors(r, whiten @ jacobian, columns, 0.5 * float(np.sum(r * r)))
+    states = [layout.state_columns(earlier + k, 15) for k in (0, 1)]
+    return residuals, jacobian, np.concatenate([*states, gravity], axis=1), covariance
 
 
 def _motion_rows(

@@ -232,10 +232,8 @@ def _integrate_all(  # type: ignore[no-untyped-def]
             for i in range(3):
                 w1[i] -= gyro_bias[n, i]
                 a1[i] -= accel_bias[n, i]
-            # the mean rate, and the coning term of a rate that changes direction
-            step[0] = 0.5 * (w0[0] + w1[0]) * dt + (w0[1] * w1[2] - w0[2] * w1[1]) * dt * dt / 12
-            step[1] = 0.5 * (w0[1] + w1[1]) * dt + (w0[2] * w1[0] - w0[0] * w1[2]) * dt * dt / 12
-            step[2] = 0.5 * (w0[2] + w1[2]) * dt + (w0[0] * w1[1] - w0[1] * w1[0]) * dt * dt / 12
+            for i in range(3):
+                step[i] = 0.5 * (w0[i] + w1[i]) * dt
             _exp3(step, turn, Jr)
             _matmul3(R, turn, R1)
             _minus_rotated_hat(R, a0, H0)

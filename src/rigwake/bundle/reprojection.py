@@ -15,9 +15,10 @@ from numba import njit
 from rigwake.bundle.frames import Frames
 from rigwake.bundle.layout import Layout, tangent_bases
 from rigwake.bundle.motion import TimedPoses
-from rigwake.bundle.problem import Indices, Mask, RigProblem, SolverOptions
+from rigwake.bundle.problem import BundleCamera, Indices, Mask, RigProblem, SolverOptions
 from rigwake.bundle.robust import robust
 from rigwake.bundle.schur import LinearObservations
+from rigwake.cameras.base import Projection
 from rigwake.geometry import so3
 from rigwake.geometry.so3 import Array
 
@@ -38,165 +39,163 @@ class Reprojection:
 
 def reproject(problem: RigProblem, frames: Frames, poses: TimedPoses, options: SolverOptions) -> Reprojection:
     """Residuals and cost alone."""
-    result, _ = _project(problem, frames, poses, options, None)
-    return result
+    views = _views(problem, frames, poses, _directions_of(problem, frames, poses), derivatives=False)
+    return _compared(problem, frames, views, options)[0]
 
 
 def linearise(
     problem: RigProblem, layout: Layout, frames: Frames, poses: TimedPoses, options: SolverOptions
 ) -> tuple[Reprojection, LinearObservations]:
-    """Residuals, cost, and whitened derivatives."""
-    width = max((_extra_width(problem, layout, c) for c in range(len(problem.cameras))), default=0)
-    m = len(frames.order)
+    """Residuals, cost, and derivatives, whitened and weighted by the robust loss."""
+    points = _directions_of(problem, frames, poses)
+    views = _views(problem, frames, poses, points, derivatives=True)
+    result, factor = _compared(problem, frames, views, options)
+    m, width = len(frames.order), max((_extra_width(camera, layout) for camera in problem.cameras), default=0)
+    by_point = np.zeros((m, 2, 3))
     linear = LinearObservations(
         frames.landmark_starts,
         frames.of_observation,
-        np.zeros((m, 2)),
+        np.where(result.valid[:, None], result.residuals_px * factor[:, None], 0.0),
         np.zeros((m, 2, 6)),
         np.zeros((m, 2, 3)),
         np.zeros((m, 2, width)),
         np.full((m, width), -1, dtype=np.int64),
     )
-    return _project(problem, frames, poses, options, (layout, linear))
-
-
-def _extra_width(problem: RigProblem, layout: Layout, camera: int) -> int:
-    name = problem.cameras[camera].name
-    blocks = [layout.shared.get((name, kind)) for kind in ("line_delay", "intrinsics")]
-    return sum(block.stop - block.start for block in blocks if block)
-
-
-def _project(
-    problem: RigProblem,
-    frames: Frames,
-    poses: TimedPoses,
-    options: SolverOptions,
-    target: tuple[Layout, LinearObservations] | None,
-) -> tuple[Reprojection, LinearObservations]:
-    m = len(frames.order)
-    residuals, valid = np.full((m, 2), np.nan), np.zeros(m, dtype=bool)
-    marks, seen = problem.landmarks, problem.observations
-    landmark_of = seen.landmark_indices[frames.order]
-    pixels, weights = seen.pixels[frames.order], 1 / seen.std_px[frames.order]
-    points = np.empty((m, 3))
-    _directions(
-        poses.world_from_body.rotation,
-        poses.world_from_body.translation,
-        frames.of_observation,
-        landmark_of,
-        marks.anchors_world,
-        marks.bearings_world,
-        marks.inverse_ranges,
-        points,
-    )
-    by_point = np.zeros((m, 2, 3)) if target else None
-    for c, (camera, rows) in enumerate(zip(problem.cameras, frames.observations, strict=True)):
-        if not len(rows):
-            continue
-        y, shift = points[rows], None
-        if camera.line_delay_s != 0 or "line_delay" in camera.free:
-            inverse_ranges = marks.inverse_ranges[landmark_of[rows]]
-            shift = _read_out(
-                camera.line_delay_s,
-                pixels[rows, 1] - camera.reference_row_px,
-                poses.twist[frames.of_observation[rows]],
-                y,
-                inverse_ranges,
-            )
-            y = shift.points
-        if target is None or by_point is None:
-            projected, valid[rows] = camera.model.project(y)
-        else:
-            view = camera.model.project_with_jacobians(y)
-            projected, valid[rows] = view.pixels, view.valid
-            by_point[rows] = view.d_point if shift is None else view.d_point @ shift.rotation
-            _fill_extras(problem, target, c, rows, view.d_params, view.d_point, shift, weights[rows])
-        residuals[rows] = projected - pixels[rows]
-    whitened = np.where(valid[:, None], residuals * weights[:, None], 0.0)
-    squared = np.einsum("mi,mi->m", whitened, whitened)
-    squared[~valid] = _UNSEEN_SIGMAS**2
-    loss, slope = robust(squared, options.loss, options.loss_scale)
-    result = Reprojection(residuals, valid, 0.5 * float(loss.sum()))
-    if target is None or by_point is None:
-        return result, _NOTHING
-    linear = target[1]
-    factor = np.where(valid, weights * np.sqrt(slope), 0.0)
-    linear.residuals[:] = np.where(valid[:, None], residuals * factor[:, None], 0.0)
-    linear.by_extras[:] *= np.sqrt(slope)[:, None, None]
+    for camera, view in zip(problem.cameras, views, strict=True):
+        d_point = view.projection.d_point * factor[view.rows, None, None]
+        by_point[view.rows] = d_point if view.read_out is None else d_point @ view.read_out.rotation
+        _fill_extras(camera, layout, linear, view, d_point, factor[view.rows])
+    marks = problem.landmarks
     _derivatives(
         poses.world_from_body.rotation,
         poses.world_from_body.translation,
         frames.of_observation,
-        landmark_of,
+        problem.observations.landmark_indices[frames.order],
         marks.anchors_world,
         marks.inverse_ranges,
         tangent_bases(marks.bearings_world),
         points,
         by_point,
-        factor,
         linear.by_frame,
         linear.by_landmark,
     )
+    for view in views:
+        if view.read_out is not None:
+            moved = np.einsum("nij,nj->ni", by_point[view.rows], view.read_out.travelled)
+            linear.by_landmark[view.rows, :, 2] -= moved
     return result, linear
 
 
 @dataclass(frozen=True, eq=False)
 class _ReadOut:
-    """Directions as seen when their row was read: y' = rotation (y - rho t), and dy' by the line delay."""
+    """Directions as seen when their row was read, y' = rotation (y - rho travelled), and dy' by the delay."""
 
     points: Array
     rotation: Array
+    travelled: Array
     by_delay: Array
 
 
-def _read_out(delay_s: float, rows_px: Array, twist: Array, y: Array, inverse_ranges: Array) -> _ReadOut:
-    """The camera moves on by its twist while the rows are read: its frame becomes `frame * Exp(twist dt)`,
-    with the rotation exact and the path straight within an image."""
-    dt = (rows_px * delay_s)[:, None]
-    rotation = so3.exp(-twist[:, :3] * dt)
-    linear = inverse_ranges[:, None] * twist[:, 3:]
-    points = np.einsum("nij,nj->ni", rotation, y - linear * dt)
-    moved = np.einsum("nij,nj->ni", rotation, linear)
-    rate = -np.cross(twist[:, :3], points) - moved
-    return _ReadOut(points, rotation, rate * rows_px[:, None])
+@dataclass(frozen=True, eq=False)
+class _View:
+    """What one camera sees: its (sorted) observations `rows`, and where their landmarks project to."""
+
+    rows: Indices
+    read_out: _ReadOut | None
+    projection: Projection
+
+
+def _directions_of(problem: RigProblem, frames: Frames, poses: TimedPoses) -> Array:
+    """(M, 3) y of the module's formula, for the frames' own times."""
+    points, marks = np.empty((len(frames.order), 3)), problem.landmarks
+    _directions(
+        poses.world_from_body.rotation,
+        poses.world_from_body.translation,
+        frames.of_observation,
+        problem.observations.landmark_indices[frames.order],
+        marks.anchors_world,
+        marks.bearings_world,
+        marks.inverse_ranges,
+        points,
+    )
+    return points
+
+
+def _views(
+    problem: RigProblem, frames: Frames, poses: TimedPoses, points: Array, derivatives: bool
+) -> list[_View]:
+    views = []
+    for camera, rows in zip(problem.cameras, frames.observations, strict=True):
+        y, read_out = points[rows], None
+        if camera.line_delay_s != 0 or "line_delay" in camera.free:
+            read_out = _read_out(problem, camera, frames, poses, rows, y)
+            y = read_out.points
+        if derivatives:
+            projection = camera.model.project_with_jacobians(y)
+        else:
+            projection = Projection(*camera.model.project(y), np.empty((0, 2, 3)), np.empty((0, 2, 0)))
+        views.append(_View(rows, read_out, projection))
+    return views
+
+
+def _compared(
+    problem: RigProblem, frames: Frames, views: list[_View], options: SolverOptions
+) -> tuple[Reprojection, Array]:
+    """Residuals and cost, and the factors (M,) that whiten and robustly weight; 0 where not valid."""
+    m, seen = len(frames.order), problem.observations
+    predicted, valid = np.full((m, 2), np.nan), np.zeros(m, dtype=bool)
+    for view in views:
+        predicted[view.rows], valid[view.rows] = view.projection.pixels, view.projection.valid
+    residuals, weights = predicted - seen.pixels[frames.order], 1 / seen.std_px[frames.order]
+    squared = np.where(valid, np.sum((residuals * weights[:, None]) ** 2, axis=1), _UNSEEN_SIGMAS**2)
+    loss, slope = robust(squared, options.loss, options.loss_scale)
+    return Reprojection(residuals, valid, 0.5 * float(loss.sum())), np.where(
+        valid, weights * np.sqrt(slope), 0.0
+    )
+
+
+def _read_out(
+    problem: RigProblem, camera: BundleCamera, frames: Frames, poses: TimedPoses, rows: Indices, y: Array
+) -> _ReadOut:
+    """The camera moves on by its twist while rows are read: its frame becomes `frame * Exp(twist dt)`, with
+    the rotation exact and the path straight within an image."""
+    pixels, landmarks = problem.observations.pixels[frames.order[rows]], problem.landmarks
+    owners = problem.observations.landmark_indices[frames.order[rows]]
+    lines = (pixels[:, 1] - camera.reference_row_px)[:, None]
+    inverse_ranges = landmarks.inverse_ranges[owners][:, None]
+    twist = poses.twist[frames.of_observation[rows]]
+    dt = lines * camera.line_delay_s
+    rotation, travelled = so3.exp(-twist[:, :3] * dt), twist[:, 3:] * dt
+    points = np.einsum("nij,nj->ni", rotation, y - inverse_ranges * travelled)
+    rate = -np.cross(twist[:, :3], points) - inverse_ranges * np.einsum("nij,nj->ni", rotation, twist[:, 3:])
+    return _ReadOut(points, rotation, travelled, rate * lines)
+
+
+def _extra_width(camera: BundleCamera, layout: Layout) -> int:
+    blocks = [layout.shared.get((camera.name, kind)) for kind in ("line_delay", "intrinsics")]
+    return sum(block.stop - block.start for block in blocks if block)
 
 
 def _fill_extras(
-    problem: RigProblem,
-    target: tuple[Layout, LinearObservations],
-    camera: int,
-    rows: Indices,
-    d_params: Array,
+    camera: BundleCamera,
+    layout: Layout,
+    linear: LinearObservations,
+    view: _View,
     d_point: Array,
-    shift: _ReadOut | None,
-    weights: Array,
+    factor: Array,
 ) -> None:
     """Derivatives by line delay and intrinsics, into columns counted from the first extra."""
-    layout, linear = target
-    name, start = problem.cameras[camera].name, 0
-    parts = {}
-    if shift is not None:
-        parts["line_delay"] = np.einsum("nij,nj->ni", d_point, shift.by_delay)[:, :, None]
-    parts["intrinsics"] = d_params
+    parts = {"intrinsics": view.projection.d_params * factor[:, None, None]}
+    if view.read_out is not None:
+        parts["line_delay"] = np.einsum("nij,nj->ni", d_point, view.read_out.by_delay)[:, :, None]
+    start = 0
     for kind, jacobian in parts.items():
-        block = layout.shared.get((name, kind))
-        if block is None:
-            continue
-        stop = start + block.stop - block.start
-        linear.by_extras[rows, :, start:stop] = jacobian * weights[:, None, None]
-        linear.extras[rows, start:stop] = np.arange(block.start, block.stop) - layout.extras_start
-        start = stop
-
-
-_NOTHING = LinearObservations(
-    np.zeros(1, np.int64),
-    np.zeros(0, np.int64),
-    np.zeros((0, 2)),
-    np.zeros((0, 2, 6)),
-    np.zeros((0, 2, 3)),
-    np.zeros((0, 2, 0)),
-    np.zeros((0, 0), np.int64),
-)
+        block = layout.shared.get((camera.name, kind))
+        if block is not None:
+            stop = start + block.stop - block.start
+            linear.by_extras[view.rows, :, start:stop] = jacobian
+            linear.extras[view.rows, start:stop] = np.arange(block.start, block.stop) - layout.extras_start
+            start = stop
 
 
 @njit(cache=True)
@@ -224,18 +223,15 @@ def _derivatives(  # type: ignore[no-untyped-def]
     bases,
     y,
     by_point,
-    factor,
     by_frame,
     by_landmark,
 ):
-    """Chain the pixels' derivatives to frames and landmarks, whitened by `factor`."""
+    """Chain the pixels' derivatives by the directions to frames and landmarks."""
     world = np.empty(3)
     for m in range(len(frames)):
-        f, k, w = frames[m], landmarks[m], factor[m]
+        f, k = frames[m], landmarks[m]
         for i in range(2):
-            a, b, c = by_point[m, i, 0] * w, by_point[m, i, 1] * w, by_point[m, i, 2] * w
-            if w == 0.0:
-                a, b, c = 0.0, 0.0, 0.0
+            a, b, c = by_point[m, i, 0], by_point[m, i, 1], by_point[m, i, 2]
             by_frame[m, i, 0] = b * y[m, 2] - c * y[m, 1]
             by_frame[m, i, 1] = c * y[m, 0] - a * y[m, 2]
             by_frame[m, i, 2] = a * y[m, 1] - b * y[m, 0]
