@@ -1,0 +1,271 @@
+"""Intrinsic calibration: from corners to a camera, its covariance, and what was left out and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigwake.cameras.base import CameraModel, Mask
+from rigwake.cameras.catalogue import camera_class
+from rigwake.errors import EstimationError, UnobservableError, UsageError
+from rigwake.geometry.se3 import SE3
+from rigwake.geometry.so3 import Array
+from rigwake.intrinsics.adjust import Corners, Estimate, adjust, linearise, residuals
+from rigwake.intrinsics.initialise import initialise, stacked
+from rigwake.intrinsics.observations import BoardObservations
+
+MIN_VIEWS = 3
+_ROBUST_ROUNDS = 4
+_OUTLIER_SIGMAS = 5.0  # one in 270 000 good corners lies beyond
+_OUTLIER_VIEW = 3.0  # a view whose median residual is that many times the typical view's
+_MEDIAN_OF_RAYLEIGH = 1.1774  # median length of a 2-D normal vector of unit standard deviation
+_PARALLEL = np.deg2rad(4.0)
+_POOR_FIT_PX = 3.0
+_FOCAL_TOLERANCE = 0.02
+_RANK_TOLERANCE = 1e-11
+
+
+@dataclass(frozen=True, eq=False)
+class IntrinsicCalibration:
+    """A calibrated camera: answer and doubt.
+
+    camera: the lens. covariance: (P, P) of `camera.params`; zero for fixed parameters, infinite on the
+    diagonal of undetermined ones. fixed, undetermined: names of parameters. cam_from_board: pose per kept view.
+    view_names: kept views. residuals_px: (N, 2) projected minus observed, corners (N): what was seen, with
+    `used` false for dropped corners. sigma_px: standard deviation of a pixel coordinate, from the residuals.
+    rms_px: root mean square distance of used corners. dropped_views: names and reasons.
+    max_observed_angle: radians off the axis of the farthest used corner.
+    """
+
+    camera: CameraModel
+    covariance: Array
+    fixed: tuple[str, ...]
+    undetermined: tuple[str, ...]
+    cam_from_board: SE3
+    view_names: tuple[str, ...]
+    corners: Corners
+    residuals_px: Array
+    sigma_px: float
+    rms_px: float
+    dropped_views: tuple[tuple[str, str], ...]
+    max_observed_angle: float
+    converged: bool
+
+    @property
+    def stds(self) -> dict[str, float]:
+        """Standard deviation by parameter name; zero if fixed, infinite if undetermined."""
+        values = np.sqrt(np.diag(self.covariance)).tolist()
+        return dict(zip(self.camera.param_names, values, strict=True))
+
+    @property
+    def dropped_corners(self) -> int:
+        """Corners left out of kept views."""
+        return int((~self.corners.used).sum())
+
+
+def calibrate(
+    observations: BoardObservations,
+    model: str,
+    *,
+    fix: Iterable[str] = (),
+    free: Iterable[str] = (),
+    max_angle: float | None = None,
+) -> IntrinsicCalibration:
+    """Camera of this model from views of a board, without a first guess.
+
+    fix, free: names of parameters to hold at their starting values, or to estimate although they are fixed by
+    default. max_angle: where the lens ends (radians), if known.
+
+    Raises EstimationError if there are too few views or the board does not fit, UnobservableError if the
+    views cannot tell the focal length, UsageError for unknown parameter names, CameraError for an unknown
+    model or a max_angle that the result cannot represent.
+    """
+    if len(observations.views) < MIN_VIEWS:
+        raise _too_few_views(observations)
+    start = initialise(observations, model)
+    mask = _free_mask(start.estimate.camera, fix, free)
+    used = observations.take(list(start.views))
+    failed = set(range(len(observations.views))) - set(start.views)
+    dropped = [(observations.views[i].name, "no pose explains its corners") for i in sorted(failed)]
+    _refuse_parallel(start.estimate.cam_from_board)
+    estimate, corners, used, outliers = _robust(start.estimate, used, mask)
+    if len(used.views) < MIN_VIEWS:
+        raise _too_few_views(used)
+    estimate, converged = adjust(estimate, corners, mask, max_steps=100)
+    result = _summary(estimate, corners, mask, used, tuple(dropped + outliers), converged)
+    if max_angle is not None:
+        result = replace(result, camera=_limited(result.camera, max_angle))
+    _refuse_poor_fit(result)
+    _refuse_unknown_focal(result)
+    return result
+
+
+def _too_few_views(observations: BoardObservations) -> EstimationError:
+    return EstimationError(
+        f"The board was found in {len(observations.views)} usable views; {MIN_VIEWS} are the least, 20 are good.",
+        consequence="A single view cannot tell a longer lens from a farther board.",
+        remedy="Record more images, with the board tilted and in every part of the image.",
+    )
+
+
+def _free_mask(camera: CameraModel, fix: Iterable[str], free: Iterable[str]) -> Mask:
+    fixed = (set(camera_class(camera.model).fixed_by_default) | set(fix)) - set(free)
+    unknown = (set(fix) | set(free)) - set(camera.param_names)
+    if unknown:
+        raise UsageError(
+            f"{camera.model} has no parameter {', '.join(sorted(unknown))}.",
+            remedy=f"It has: {', '.join(camera.param_names)}.",
+        )
+    return np.array([name not in fixed for name in camera.param_names])
+
+
+def _refuse_parallel(cam_from_board: SE3) -> None:
+    normals = cam_from_board.rotation[:, :, 2]
+    spread = np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))
+    if spread < _PARALLEL:
+        raise UnobservableError(
+            f"All views show the board at the same tilt, within {np.rad2deg(spread):.1f} deg.",
+            consequence="A longer focal length and a farther board look alike then.",
+            remedy="Tilt the board by 30 to 45 deg in different directions and record again.",
+        )
+
+
+def _robust(
+    estimate: Estimate, observations: BoardObservations, free: Mask
+) -> tuple[Estimate, Corners, BoardObservations, list[tuple[str, str]]]:
+    """Rounds of Huber's loss with the noise re-estimated; then outlier views and corners are left out."""
+    corners, sigma = stacked(observations), 2.0
+    for _ in range(_ROBUST_ROUNDS):
+        estimate, _ = adjust(estimate, corners, free, sigma_px=sigma, max_steps=40)
+        sigma = _noise(estimate, corners)
+    lengths = _lengths(estimate, corners)
+    medians = np.array([np.median(lengths[rows]) for rows in corners.slices])
+    typical = float(np.median(medians))
+    keep = np.flatnonzero(medians <= _OUTLIER_VIEW * typical)
+    outliers = [
+        (observations.views[v].name, f"median residual {medians[v]:.2f} px, typical is {typical:.2f} px")
+        for v in np.flatnonzero(medians > _OUTLIER_VIEW * typical)
+    ]
+    kept = observations.take(keep)
+    estimate = Estimate(estimate.camera, estimate.cam_from_board[keep])
+    corners = stacked(kept)
+    estimate, _ = adjust(estimate, corners, free, sigma_px=sigma, max_steps=40)
+    sigma = _noise(estimate, corners)
+    inliers = _lengths(estimate, corners) <= _OUTLIER_SIGMAS * sigma
+    return estimate, replace(corners, used=inliers), kept, outliers
+
+
+def _lengths(estimate: Estimate, corners: Corners) -> Array:
+    r, valid = residuals(estimate, corners)
+    return np.where(valid, np.linalg.norm(r, axis=1), np.inf)
+
+
+def _noise(estimate: Estimate, corners: Corners) -> float:
+    """Robust standard deviation of a pixel coordinate; never below what a float image can tell."""
+    return max(float(np.median(_lengths(estimate, corners))) / _MEDIAN_OF_RAYLEIGH, 1e-6)
+
+
+def _summary(
+    estimate: Estimate,
+    corners: Corners,
+    free: Mask,
+    observations: BoardObservations,
+    dropped: tuple[tuple[str, str], ...],
+    converged: bool,
+) -> IntrinsicCalibration:
+    r, valid = residuals(estimate, corners)
+    used = corners.used & valid
+    squares = float(np.sum(r[used] ** 2))
+    unknowns = int(free.sum()) + 6 * len(observations.views)
+    if 2 * used.sum() <= unknowns:
+        raise EstimationError(f"{used.sum()} corners cannot determine {unknowns} unknowns.")
+    variance = squares / (2 * used.sum() - unknowns)
+    information, _, _ = linearise(estimate, corners, free, None).reduced()
+    covariance, undetermined = _covariance(estimate.camera, information, free, variance)
+    names = estimate.camera.param_names
+    moved = estimate.cam_from_board[corners.view_index]
+    rays = np.einsum("nij,nj->ni", moved.rotation, corners.points_board) + moved.translation
+    angles = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    return IntrinsicCalibration(
+        camera=estimate.camera,
+        covariance=covariance,
+        fixed=tuple(name for name, is_free in zip(names, free, strict=True) if not is_free),
+        undetermined=undetermined,
+        cam_from_board=estimate.cam_from_board,
+        view_names=tuple(view.name for view in observations.views),
+        corners=replace(corners, used=used),
+        residuals_px=r,
+        sigma_px=float(np.sqrt(variance)),
+        rms_px=float(np.sqrt(squares / used.sum())),
+        dropped_views=dropped,
+        max_observed_angle=float(angles[used].max()),
+        converged=converged,
+    )
+
+
+def _covariance(
+    camera: CameraModel, information: Array, free: Mask, variance: float
+) -> tuple[Array, tuple[str, ...]]:
+    """Covariance of the parameters, and the names of those that the views do not determine: those with a
+    part in the null space of the information (relative to its diagonal)."""
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    known = eigenvalues > _RANK_TOLERANCE
+    inverse = (vectors[:, known] / eigenvalues[known]) @ vectors[:, known].T
+    block = variance * inverse / np.outer(scale, scale)
+    lost = (vectors[:, ~known] ** 2).sum(axis=1) > 1e-3
+    block[lost, :] = 0.0
+    block[:, lost] = 0.0
+    block[lost, lost] = np.inf
+    covariance = np.zeros((len(free), len(free)))
+    covariance[np.ix_(free, free)] = block
+    return covariance, tuple(np.array(camera.param_names)[free][lost].tolist())
+
+
+def axis_focal_px(camera: CameraModel) -> float:
+    """Pixels per radian at the optical axis, whatever the model calls its focal length."""
+    at_axis = camera.project_with_jacobians(np.array([[0.0, 0.0, 1.0]])).d_point[0, :, :2]
+    return float(np.sqrt(abs(np.linalg.det(at_axis))))
+
+
+def axis_focal_std_px(camera: CameraModel, covariance: Array) -> float:
+    """Standard deviation of `axis_focal_px`, by central differences along the parameters."""
+    gradient = np.zeros(len(covariance))
+    for i, std in enumerate(np.sqrt(np.diag(covariance))):
+        if not np.isfinite(std):
+            return np.inf
+        if std > 0:
+            step = np.zeros(len(covariance))
+            step[i] = 1e-3 * std
+            longer = axis_focal_px(camera.with_params(camera.params + step))
+            shorter = axis_focal_px(camera.with_params(camera.params - step))
+            gradient[i] = (longer - shorter) / (2 * step[i])
+    return float(np.sqrt(gradient @ covariance @ gradient))
+
+
+def _limited(camera: CameraModel, max_angle: float) -> CameraModel:
+    return camera_class(camera.model)(
+        tuple(camera.params.tolist()), camera.width_px, camera.height_px, max_angle
+    )
+
+
+def _refuse_poor_fit(result: IntrinsicCalibration) -> None:
+    if result.sigma_px > _POOR_FIT_PX:
+        raise EstimationError(
+            f"The best {result.camera.model} lens leaves residuals of {result.sigma_px:.1f} px.",
+            consequence="Either the board is not what was said, or this model does not fit the lens.",
+            remedy="Check the board's columns, rows, size and spacing; try another --model.",
+        )
+
+
+def _refuse_unknown_focal(result: IntrinsicCalibration) -> None:
+    focal = axis_focal_px(result.camera)
+    std = axis_focal_std_px(result.camera, result.covariance)
+    if not std <= _FOCAL_TOLERANCE * focal:
+        raise UnobservableError(
+            f"The views do not determine the focal length: {focal:.0f} px, give or take {std:.0f} px.",
+            consequence="It was found to no better than 2 %: any use of it would be a guess.",
+            remedy="Add views with the board tilted by 30 to 45 deg, close, and in the image's corners.",
+        )
