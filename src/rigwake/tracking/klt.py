@@ -31,7 +31,7 @@ def follow(
     start = pixels.astype(np.float32)
     # cv2 writes its answer into the fourth argument, too
     landed, found = _lucas_kanade(before, after, start, predicted.astype(np.float32), window_px, levels)
-    returned, found_back = _lucas_kanade(after, before, landed, start.copy(), window_px, levels)
+    returned, found_back = _lucas_kanade(after, before, landed, start.copy(), window_px, min(levels, 2))
     error = np.linalg.norm(returned - start, axis=1)
     believed = found & found_back & (error <= max_forward_backward_px)
     return landed.astype(np.float64), believed

@@ -67,6 +67,8 @@ class KltFrontEnd:
         self.live: _Live | None = None
         self.image: Image | None = None
         self.next_id = 0
+        self.count_detected = 0
+        self.steps_since_detection = 0
 
     def forget(self) -> None:
         """Start anew: the next image does not continue the last one."""
@@ -76,10 +78,19 @@ class KltFrontEnd:
         """Observations in the next image; `usable` (H, W) says where points may be."""
         coefficients = spline_coefficients(image)
         live = self._continue(image, coefficients, usable)
-        if live is None or len(live.ids) < self.options.redetect_below * self.options.max_features:
+        self.steps_since_detection += 1
+        if live is None or self._should_detect(len(live.ids)):
             live = self._detect(image, coefficients, usable, live)
+            self.count_detected, self.steps_since_detection = len(live.ids), 0
         self.live, self.image = live, image
         return live.ids, live.pixels, live.std_px
+
+    def _should_detect(self, count: int) -> bool:
+        """Many points were lost since the last detection, or it is long ago and there is room for more."""
+        options = self.options
+        many_lost = count < options.redetect_below * min(self.count_detected, options.max_features)
+        due = self.steps_since_detection >= options.redetect_every
+        return many_lost or (due and count < options.redetect_below * options.max_features)
 
     def _continue(self, image: Image, coefficients: Coefficients, usable: Mask) -> _Live | None:
         """The live points that are found in the image."""

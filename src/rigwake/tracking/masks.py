@@ -52,15 +52,20 @@ class HorizonMask:
 
     def __init__(self, model: CameraModel, margin: float = np.deg2rad(0.5)) -> None:
         """margin: radians above the horizon that are left out with it, for errors of the attitude."""
-        bearings, _ = model.unproject(pixel_grid(model.width_px, model.height_px))
-        self._bearings = bearings.astype(np.float32)
         self._shape = (model.height_px, model.width_px)
+        rows, columns = -(-model.height_px // 2), -(-model.width_px // 2)
+        bearings, _ = model.unproject(2 * pixel_grid(columns, rows) + 0.5)
+        planes = np.nan_to_num(bearings, nan=0.0).astype(np.float32).T
+        self._x, self._y, self._z = (np.ascontiguousarray(p).reshape(rows, columns) for p in planes)
         self._sine = np.float32(np.sin(margin))
 
     def below(self, up_cam: Array) -> Mask:
-        """(H, W), True below the horizon; `up_cam` (3,) is the unit vector against gravity in camera axes."""
-        height = self._bearings @ up_cam.astype(np.float32)
-        return np.asarray(~(height >= self._sine).reshape(self._shape))
+        """(H, W), True below the horizon (in steps of 2 px); `up_cam` (3,) is the unit vector against gravity in
+        camera axes."""
+        x, y, z = up_cam.astype(np.float32)
+        below = x * self._x + y * self._y + z * self._z < self._sine
+        height, width = self._shape
+        return np.asarray(np.repeat(np.repeat(below, 2, axis=0), 2, axis=1)[:height, :width])
 
 
 def inside(usable: Mask, pixels: Array) -> Mask:
