@@ -1,0 +1,145 @@
+"""`calibrate_handeye`: from trajectories to mountings, with doubt."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rigwake.calibration.values import CalibratedCamera, UndeterminedDirection
+from rigwake.errors import EstimationError, UnobservableError
+from rigwake.geometry import so3
+from rigwake.geometry.se3 import SE3
+from rigwake.geometry.so3 import Array
+from rigwake.handeye.information import USEFUL_CLOCK, USEFUL_LOG_SCALE
+from rigwake.handeye.initial import initial_mountings
+from rigwake.handeye.likelihood import Estimate, maximise
+from rigwake.handeye.motions import Mounting
+from rigwake.handeye.observability import covariance, open_directions
+from rigwake.handeye.problem import HandeyeProblem, pose_problem
+from rigwake.handeye.seed import seed_handeye
+from rigwake.handeye.values import HandeyeOptions, HandeyeResult
+from rigwake.sync import estimate_time_offset
+from rigwake.trajectory import Trajectory
+
+
+def calibrate_handeye(
+    reference: Trajectory, members: Sequence[Trajectory], options: HandeyeOptions | None = None
+) -> HandeyeResult:
+    """Where every member sits on the reference, from nothing but their trajectories.
+
+    The trajectories may have any origin, rate and clock; members may be up to scale. All members are solved
+    together, so that loops through them close exactly.
+
+    Raises UsageError (names, a reference up to scale), UnobservableError (nothing of a member is determined,
+    or its clock cannot be aligned), EstimationError (no convergence).
+    """
+    options = options or HandeyeOptions()
+    problem = pose_problem(reference, members, options)
+    offsets = [
+        estimate_time_offset(reference, member).offset_s if options.time_offset else 0.0 for member in members
+    ]
+    start = initial_mountings(problem, offsets)
+    if options.method == "seed":
+        return _seed_result(problem, start)
+    estimate = maximise(problem, start, options)
+    if not estimate.converged:
+        raise EstimationError(
+            f"Hand-eye calibration did not settle within {options.max_iterations} steps.",
+            consequence="The motion or the trajectories do not support the model.",
+            remedy="Look at the trajectories: do they show one rigid body? Try --noise poses or increments.",
+        )
+    return _result(problem, estimate, options)
+
+
+def _result(problem: HandeyeProblem, estimate: Estimate, options: HandeyeOptions) -> HandeyeResult:
+    total = covariance(problem, estimate)
+    reference = problem.reference.trajectory
+    R = reference.world_from_body.rotation
+    turns = so3.log(np.swapaxes(R[:-1], -1, -2) @ R[1:])
+    members, raw, scales, spread = {}, {}, {}, {}
+    start = 0
+    columns: list[int] = []
+    for m, (curve, layout) in enumerate(zip(problem.members, problem.layouts, strict=True)):
+        name, mounting = curve.trajectory.name, estimate.mountings[m]
+        block = total[start : start + layout.size, start : start + layout.size]
+        columns += range(start, start + 6)
+        start += layout.size
+        valid = estimate.valid[:, m]
+        spread[name] = estimate.residuals[m][valid].std(axis=0)
+        stds = np.sqrt(np.diag(block)[layout.scales])
+        known = np.where(stds < USEFUL_LOG_SCALE, 1.0, np.nan)
+        values = np.exp(mounting.log_scales[: layout.scale_count])
+        scales[name] = np.stack([values * known, values * stds * known], axis=1)
+        clock_std = float(np.sqrt(np.diag(block)[layout.clock].sum()))
+        clock_known = layout.has_clock and clock_std < USEFUL_CLOCK
+        raw[name] = mounting.ref_from_member
+        single = layout.scale_count == 1
+        members[name] = CalibratedCamera(
+            name,
+            mounting.ref_from_member,
+            block[:6, :6],
+            undetermined=_checked_directions(problem, m, mounting.ref_from_member, block, turns),
+            time_offset_s=mounting.time_offset_s if clock_known else None,
+            time_offset_std_s=clock_std if clock_known else None,
+            scale=float(scales[name][0, 0]) if single else None,
+            scale_std=float(scales[name][0, 1]) if single else None,
+            statistics={"steps": int(valid.sum())},
+        )
+    return HandeyeResult(
+        reference.name,
+        members,
+        raw,
+        total[np.ix_(columns, columns)],
+        scales,
+        _noise_words(problem),
+        spread,
+        int(estimate.equations.used.sum()),
+        int(np.sum(estimate.equations.weights < 1)),
+        estimate.iterations,
+        estimate.converged,
+    )
+
+
+def _checked_directions(
+    problem: HandeyeProblem, m: int, X: SE3, block: Array, turns: Array
+) -> tuple[UndeterminedDirection, ...]:
+    reference, name = problem.reference.trajectory.name, problem.members[m].trajectory.name
+    found = open_directions(reference, name, X, block[:6, :6], turns)
+    if len(found) == 6:
+        raise UnobservableError(
+            f"The motion determines nothing of how {name} sits on {reference}.",
+            consequence="They stood still, or moved by less than the noise of their trajectories.",
+            remedy="Record a minute of turning through at least 60 degrees, to both sides, in waves if possible.",
+        )
+    return found
+
+
+def _noise_words(problem: HandeyeProblem) -> str:
+    source = "as declared" if problem.has_known_noise else "levels learnt from the residuals"
+    return f"{problem.noise}, {source}"
+
+
+def _seed_result(problem: HandeyeProblem, start: Sequence[Mounting]) -> HandeyeResult:
+    reference, sampled = problem.sampled(start)
+    raw, members = {}, {}
+    unknown = np.full((6, 6), np.nan)
+    for curve, member, mounting in zip(problem.members, sampled, start, strict=True):
+        name = curve.trajectory.name
+        both = (reference.segments >= 0) & (member.segments >= 0)
+        raw[name] = seed_handeye(reference.world_from_body[both], member.world_from_body[both])
+        offset = mounting.time_offset_s if problem.layouts[0].has_clock else None
+        members[name] = CalibratedCamera(name, raw[name], unknown, time_offset_s=offset)
+    return HandeyeResult(
+        problem.reference.trajectory.name,
+        members,
+        raw,
+        np.full((6 * len(raw), 6 * len(raw)), np.nan),
+        {name: np.zeros((0, 2)) for name in raw},
+        "ignored",
+        {name: np.full(6, np.nan) for name in raw},
+        len(reference.segments),
+        0,
+        1,
+        True,
+    )

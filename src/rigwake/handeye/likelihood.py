@@ -1,0 +1,135 @@
+"""Maximum likelihood over mountings, clocks, scales (and world gauges): a few Gauss-Newton steps.
+
+The cost is `sum_k rho(r_k^T S_k^-1 r_k)` over steps in time, S the covariance of the stacked residuals of all
+members (see `noise`), rho Huber's. It is minimised over the true motions as well (profile likelihood), which
+is what the agreed motions in the Jacobians of `motions` amount to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigwake.geometry.so3 import Array
+from rigwake.handeye.information import (
+    USEFUL_CLOCK,
+    USEFUL_ROTATION,
+    Equations,
+    form_equations,
+    useful_units,
+)
+from rigwake.handeye.motions import Mounting, residuals
+from rigwake.handeye.noise import Jitter, StepNoise, fit_jitter, known_noise, learnt_noise
+from rigwake.handeye.problem import HandeyeProblem, step_covariances
+from rigwake.handeye.values import HandeyeOptions
+
+_MOVES_LESS = 1e-3  # of a standard deviation: converged
+_SETTLED = 0.3  # of a standard deviation: near enough to learn the noise from the residuals
+_LONGEST_TURN = 0.5  # radians in one step
+_UNDETERMINED = 1e-4  # information, in useful units, that no step follows
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The solver's end: unknowns, the normal equations and (N, 6) residuals there, and how it went."""
+
+    mountings: tuple[Mounting, ...]
+    equations: Equations
+    residuals: tuple[Array, ...]
+    valid: NDArray[np.bool_]
+    filters: tuple[Jitter, ...]
+    iterations: int
+    converged: bool
+
+
+class _Solver:
+    """The problem at the current unknowns; steps are resampled only when a clock moved."""
+
+    def __init__(self, problem: HandeyeProblem, start: Sequence[Mounting], options: HandeyeOptions):
+        self.problem, self.options = problem, options
+        self.covariances = step_covariances(problem, options) if problem.has_known_noise else {}
+        self.filters = (Jitter(),) * len(start)
+        self.move_to(tuple(start), resample=True)
+
+    def move_to(self, mountings: tuple[Mounting, ...], *, resample: bool) -> None:
+        self.mountings = mountings
+        if resample:
+            self.steps = self.problem.steps(mountings)
+            self.valid = np.stack([s.valid for s in self.steps], axis=1)
+            if self.covariances:
+                self.over_steps = self.problem.known_covariances(mountings, self.covariances)
+        self.residuals = tuple(residuals(s, x) for s, x in zip(self.steps, mountings, strict=True))
+
+    def learn_filters(self) -> None:
+        self.filters = tuple(fit_jitter(r, self.valid[:, m]) for m, r in enumerate(self.residuals))
+
+    def noise(self) -> StepNoise:
+        frames = [x.ref_from_member for x in self.mountings]
+        if self.covariances:
+            return known_noise(frames, *self.over_steps)
+        filtered = [f.apply(r) for f, r in zip(self.filters, self.residuals, strict=True)]
+        return learnt_noise(frames, np.concatenate(filtered, axis=1), self.valid)
+
+    def equations(self, *, with_feigned: bool = False) -> Equations:
+        return form_equations(
+            self.problem,
+            self.steps,
+            self.mountings,
+            self.residuals,
+            self.noise(),
+            self.filters,
+            robust=self.options.robust,
+            with_feigned=with_feigned,
+        )
+
+    def step(self) -> float:
+        """One Gauss-Newton step; its length in standard deviations."""
+        tangent, moved = _bounded_step(self.equations(), useful_units(self.problem.layouts))
+        ends = np.cumsum([layout.size for layout in self.problem.layouts])
+        parts = np.split(tangent, ends[:-1])
+        moves = zip(self.mountings, parts, self.problem.layouts, strict=True)
+        clocks_moved = any(
+            np.any(part[layout.clock]) for part, layout in zip(parts, self.problem.layouts, strict=True)
+        )
+        self.move_to(tuple(x.retract(part, layout) for x, part, layout in moves), resample=clocks_moved)
+        return moved
+
+
+def maximise(problem: HandeyeProblem, start: Sequence[Mounting], options: HandeyeOptions) -> Estimate:
+    """Gauss-Newton from `start` until a step moves nothing by more than a thousandth of its deviation."""
+    solver = _Solver(problem, start, options)
+    learning = problem.noise == "estimated"
+    moved, iterations, settled = np.inf, 0, not learning
+    while (moved > _MOVES_LESS or not settled) and iterations < options.max_iterations:
+        if learning and moved < _SETTLED:
+            solver.learn_filters()
+            settled = True
+        moved = solver.step()
+        iterations += 1
+    return Estimate(
+        solver.mountings,
+        solver.equations(with_feigned=True),
+        solver.residuals,
+        solver.valid,
+        solver.filters,
+        iterations,
+        moved <= _MOVES_LESS,
+    )
+
+
+def _bounded_step(equations: Equations, units: Array) -> tuple[Array, float]:
+    """The Gauss-Newton step along the directions that anything determines, and its length in deviations."""
+    values, vectors = np.linalg.eigh(equations.information * units[:, None] * units[None, :])
+    gradient = vectors.T @ (equations.scores.sum(axis=0) * units)
+    known = values > _UNDETERMINED
+    coefficients = np.zeros_like(gradient)
+    coefficients[known] = -gradient[known] / values[known]
+    moved = float(np.sqrt(np.sum(coefficients[known] ** 2 * values[known])))
+    step = (vectors @ coefficients) * units
+    limits = np.full(len(units), np.inf)
+    limits[units == USEFUL_ROTATION] = _LONGEST_TURN
+    limits[units == USEFUL_CLOCK] = USEFUL_CLOCK
+    return step * min(1.0, float(np.min(limits / np.maximum(np.abs(step), 1e-300)))), moved

@@ -1,0 +1,176 @@
+"""What the residuals' noise is: known from both sides, or learnt from the residuals themselves.
+
+For M members against one reference the residuals of a step are `r_m = Ad(X_m^-1) a - b_m`: the reference's
+error a is common to all of them. Their joint covariance S (6 M, 6 M) is `Sa + diag(Sb)` with
+`Sa_mn = Ad(X_m^-1) Cov(a) Ad(X_n^-1)^T`; members see each other through its off-diagonal blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+from scipy.stats import chi2
+
+from rigwake.geometry.se3 import SE3
+from rigwake.geometry.so3 import Array
+from rigwake.handeye.resample import Curve
+
+ROTATION_FLOOR = 1e-9  # rad; nothing is known better than rounding allows
+TRANSLATION_FLOOR = 1e-9  # m
+FLOOR = np.repeat([ROTATION_FLOOR**2, TRANSLATION_FLOOR**2], 3)
+OUTLIER_PROBABILITY = 1e-3
+_CHI2_MEDIAN, _CHI2_LIMIT = float(chi2.ppf(0.5, 3)), float(chi2.ppf(1 - OUTLIER_PROBABILITY, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class StepNoise:
+    """Covariances of stacked residuals: S and the reference's part Sa, (1 or N, 6 M, 6 M)."""
+
+    total: Array
+    of_reference: Array
+
+    def restricted(self, chosen: NDArray[np.int64], rows: NDArray[np.int64]) -> StepNoise:
+        """For the steps `chosen` and the members whose stacked rows are `rows`."""
+        pick = np.ix_(np.arange(1) if len(self.total) == 1 else chosen, rows, rows)
+        return StepNoise(self.total[pick], self.of_reference[pick])
+
+    def inverse(self) -> Array:
+        """S^-1, after scaling to unit diagonal (rotation and translation differ by many decades)."""
+        scale = 1 / np.sqrt(np.einsum("nii->ni", self.total))
+        normalised = self.total * scale[:, :, None] * scale[:, None, :]
+        return np.asarray(np.linalg.inv(normalised) * scale[:, :, None] * scale[:, None, :])
+
+
+def known_noise(mountings: Sequence[SE3], reference: Array, members: Sequence[Array]) -> StepNoise:
+    """Propagate Cov(a) (N, 6, 6) and Cov(b_m) (N, 6, 6) into the residuals.
+
+    The products of both rotation errors with the lever arm are of second order, but without them exact
+    translations beside noisy rotations would be believed beyond what the first order is true to.
+    """
+    stacked = np.concatenate([X.inverse().adjoint() for X in mountings], axis=0)  # (6 M, 6)
+    of_reference = stacked @ (reference + np.diag(FLOOR)) @ stacked.T
+    total = of_reference.copy()
+    for m, covariance in enumerate(members):
+        block = slice(6 * m, 6 * m + 6)
+        total[:, block, block] += covariance + np.diag(FLOOR)
+        both = np.trace(reference[:, :3, :3] + covariance[:, :3, :3], axis1=1, axis2=2) / 3
+        arm = float(np.sum(mountings[m].translation ** 2))
+        total[:, range(6 * m + 3, 6 * m + 6), range(6 * m + 3, 6 * m + 6)] += (both**2 * arm / 4)[:, None]
+    return StepNoise(total, of_reference)
+
+
+def learnt_noise(mountings: Sequence[SE3], residuals: Array, known: NDArray[np.bool_]) -> StepNoise:
+    """Noise levels from residuals (N, 6 M), `known` (N, M) where they are valid.
+
+    Each trajectory gets one level for rotation and one for translation. More freedom (a full covariance)
+    would also absorb errors that grow with the motion, such as a wrong scale, and bend the estimate after
+    them. One member cannot tell whose error it is: then both sides are taken to be equally noisy.
+    """
+    rotation = _levels(residuals, known, mountings, 0, np.zeros(len(mountings)))
+    # an error in rotation moves the member by the lever arm: E|r_t|^2 holds 2 |t|^2 var_a of it
+    arms = np.array([np.sum(X.translation**2) for X in mountings])
+    translation = _levels(residuals, known, mountings, 3, 2 * arms * rotation[0])
+    own = [np.diag(np.repeat([r, t], 3)) for r, t in zip(rotation, translation, strict=True)]
+    return known_noise(mountings, own[0][None], [c[None] for c in own[1:]])
+
+
+def _levels(
+    residuals: Array, known: NDArray[np.bool_], mountings: Sequence[SE3], first: int, explained: Array
+) -> Array:
+    """Variances per axis `[reference, members...]` of the three rows from `first` of every member."""
+    parts = [residuals[:, 6 * m + first : 6 * m + first + 3] for m in range(len(mountings))]
+    squares = np.array(
+        [
+            max(_robust_mean(np.sum(r[known[:, m]] ** 2, axis=1)) - explained[m], 1e-3 * explained[m]) / 3
+            for m, r in enumerate(parts)
+        ]
+    )  # of reference and member together
+    shared = [
+        np.mean(np.sum((r @ X.rotation.T) * (other @ Y.rotation.T), axis=1)[known[:, m] & known[:, n]]) / 3
+        for m, (r, X) in enumerate(zip(parts, mountings, strict=True))
+        for n, (other, Y) in enumerate(zip(parts[:m], mountings[:m], strict=True))
+        if (known[:, m] & known[:, n]).sum() > 30
+    ]
+    smallest = float(squares.min())
+    reference = float(np.clip(np.mean(shared), 0.1 * smallest, 0.9 * smallest)) if shared else smallest / 2
+    return np.array([reference, *(squares - reference)])
+
+
+def _robust_mean(squared_lengths: Array) -> float:
+    """Mean of `|r|^2` (three Gaussian rows) with the outliers pulled in: starts from the median."""
+    if not len(squared_lengths):
+        return 0.0
+    mean = 3 * float(np.median(squared_lengths)) / _CHI2_MEDIAN
+    limit = _CHI2_LIMIT / 3 * mean
+    return float(np.mean(np.minimum(squared_lengths, limit)))
+
+
+def robust_weights(squared: Array, dimension: int) -> Array:
+    """Huber weights that touch one in a thousand steps of Gaussian noise."""
+    limit = chi2.ppf(1 - OUTLIER_PROBABILITY, dimension)
+    return np.asarray(np.sqrt(np.minimum(1.0, limit / np.maximum(squared, 1e-300))))
+
+
+@dataclass(frozen=True)
+class Jitter:
+    """Prediction errors of increments that hold a random walk (drift) and white noise of the poses (jitter).
+
+    Such increments are a moving average `r_k = e_k - theta e_(k-1)` with white e: theta is 0 without jitter
+    and nears 1 without drift. The filter recovers e. One theta for rotation and one for translation, the
+    same for all axes, so that nothing depends on the choice of axes.
+    """
+
+    rotation: float = 0.0
+    translation: float = 0.0
+
+    def apply(self, rows: Array) -> Array:
+        """Filter residuals (N, 6) or Jacobians (N, 6, P) along time."""
+        if self.rotation == 0 and self.translation == 0:
+            return rows
+        parts = [
+            _innovations(rows[:, :3], self.rotation),
+            _innovations(rows[:, 3:], self.translation),
+        ]
+        return np.concatenate(parts, axis=1)
+
+
+_THETAS = (0.0, 0.2, 0.4, 0.6, 0.7, 0.8, 0.86, 0.9, 0.93, 0.95, 0.965, 0.975, 0.98)
+
+
+def _innovations(rows: Array, theta: float) -> Array:
+    return rows if theta == 0 else np.asarray(lfilter([1.0], [1.0, -theta], rows, axis=0))
+
+
+def fit_jitter(residuals: Array, valid: NDArray[np.bool_]) -> Jitter:
+    """The filter with the smallest prediction errors (conditional least squares), per part of (N, 6).
+
+    Theta stays so far from 1 that the filter settles within a tenth of the data.
+    """
+    thetas = [theta for theta in _THETAS if theta <= max(0.0, 1 - 10 / max(valid.sum(), 1))]
+    best = []
+    for rows in (residuals[:, :3], residuals[:, 3:]):
+        errors = [_robust_mean(np.sum(_innovations(rows, theta)[valid] ** 2, axis=1)) for theta in thetas]
+        best.append(thetas[int(np.argmin(errors))])
+    return Jitter(*best)
+
+
+def noise_over_steps(covariances: Array, curve: Curve, times_s: Array, absolute: bool) -> Array:
+    """Covariances of a trajectory's poses, or of its motions between neighbouring `times_s`: (., 6, 6).
+
+    Increments add up along the way (their small rotation between is neglected); a step that covers part of
+    an increment gets that part of its covariance.
+    """
+    n = len(curve.times_s)
+    flat = covariances.reshape(n, 36)
+    left = np.clip(np.searchsorted(curve.times_s, times_s + 1e-6) - 1, 0, n - 2)
+    alpha = np.clip((times_s - curve.times_s[left]) / np.diff(curve.times_s)[left], 0.0, 1.0)[:, None]
+    if absolute:
+        at = flat[left] * (1 - alpha) + flat[left + 1] * alpha
+        return np.asarray(at.reshape(-1, 6, 6))
+    summed = np.cumsum(np.vstack([np.zeros(36), flat[1:]]), axis=0)
+    reached = summed[left] + alpha * flat[left + 1]
+    return np.diff(reached, axis=0).reshape(-1, 6, 6)

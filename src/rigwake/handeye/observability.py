@@ -1,0 +1,134 @@
+"""What the motion determined, how well, in words, and which motion would help.
+
+The information matrix holds two parts: what the true motion gave, and what the noise feigned (see `motions`).
+Only the first counts. Directions are judged in units at which a result is as good as none: 5 degrees, 1 m,
+0.1 s, a factor e in scale. A direction is open when its standard deviation exceeds one such unit, or when the
+excitation found does not stand out from the noise. Open directions enter the covariance with ten units, so
+that whatever depends on them is as unsure as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rigwake.calibration.values import UndeterminedDirection
+from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
+from rigwake.geometry.so3 import Array
+from rigwake.handeye.information import USEFUL_ROTATION, USEFUL_TRANSLATION, useful_units
+from rigwake.handeye.likelihood import Estimate
+from rigwake.handeye.problem import HandeyeProblem
+
+_OPEN_UNITS = 10.0  # how far an open direction may be off: 50 degrees, 10 m
+_STANDS_OUT = 5.0  # standard deviations of the feigned information, when the noise is known
+_BLOCKS = 60  # of time, whose scores are taken to be independent
+_NEGLIGIBLE = 0.02  # component of a direction that is not worth naming
+
+
+def covariance(problem: HandeyeProblem, estimate: Estimate) -> Array:
+    """Covariance of all unknowns, open directions included: (P, P).
+
+    Sandwich `H^-1 M H^-1` with H the information of the true motion. M is the raw information if the noise
+    is known; it exceeds H by what the errors of the Jacobians add. If the noise was learnt, M is not less
+    than the scatter of the scores over blocks of time, which holds correlation that no model foresaw.
+    """
+    equations = estimate.equations
+    units = useful_units(problem.layouts)
+    assert equations.feigned is not None
+    scaling = units[:, None] * units[None, :]
+    raw, feigned = equations.information * scaling, equations.feigned * scaling
+    values, vectors = np.linalg.eigh(raw - feigned)
+    fake = np.einsum("ip,ij,jp->p", vectors, feigned, vectors)
+    doubt = _STANDS_OUT * np.sqrt(2 / max(equations.used.sum(), 1)) if problem.has_known_noise else 1.0
+    known = values > np.maximum(1.0, doubt * fake)
+    basis = vectors[:, known] / np.sqrt(values[known])  # H^-1 = basis basis^T
+    middle = basis.T @ raw @ basis
+    if not problem.has_known_noise:
+        middle = _at_least(middle, basis.T @ (_scatter(equations.scores[equations.used]) * scaling) @ basis)
+    found = basis @ middle @ basis.T
+    unknown = vectors[:, ~known]
+    return np.asarray((found + _OPEN_UNITS**2 * unknown @ unknown.T) * scaling)
+
+
+def _scatter(scores: Array) -> Array:
+    blocks = np.array([part.sum(axis=0) for part in np.array_split(scores, min(_BLOCKS, len(scores)))])
+    return np.asarray(blocks.T @ blocks * (len(blocks) / max(len(blocks) - 1, 1)))
+
+
+def _at_least(smaller: Array, larger: Array) -> Array:
+    """The second matrix, raised to the first in every direction in which it is less."""
+    root = np.linalg.cholesky(smaller)
+    inverse = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(inverse @ larger @ inverse.T)
+    mixed = root @ vectors
+    return np.asarray((mixed * np.maximum(values, 1.0)) @ mixed.T)
+
+
+def open_directions(
+    reference: str, member: str, ref_from_member: SE3, member_covariance: Array, turns: Array
+) -> tuple[UndeterminedDirection, ...]:
+    """Directions of one mounting, in the axes of the reference, that are not determined.
+
+    member_covariance: (6, 6) right tangent. turns: (N, 3) rotation vectors of the reference's motion.
+    """
+    units = np.repeat([USEFUL_ROTATION, USEFUL_TRANSLATION], 3)
+    scaled = covariance_in_axes_of_a(ref_from_member, member_covariance) / (units[:, None] * units[None, :])
+    values, vectors = np.linalg.eigh(scaled)
+    wide = vectors[:, values > 1.0] * units[:, None]
+    directions = [_tidy(v) for v in _translations_first(wide)]
+    return tuple(
+        UndeterminedDirection(d, _words(d, reference, member), _remedy(d, directions, turns))
+        for d in directions
+    )
+
+
+def _translations_first(wide: Array) -> list[Array]:
+    """A basis of the columns' span that begins with its pure translations, along the axes if all are open."""
+    if not wide.shape[1]:
+        return []
+    basis, _ = np.linalg.qr(wide)
+    _, singular, Vt = np.linalg.svd(basis[:3])
+    padded = np.concatenate([singular, np.zeros(Vt.shape[0] - len(singular))])
+    pure = basis @ Vt[padded < _NEGLIGIBLE].T
+    rest = basis @ Vt[padded >= _NEGLIGIBLE].T
+    if pure.shape[1] == 3:
+        pure = np.eye(6)[:, 3:]
+    return [*pure.T, *rest.T]
+
+
+def _tidy(direction: Array) -> Array:
+    """Unit length, negligible components zero, largest component positive."""
+    d = direction / np.linalg.norm(direction)
+    d = np.where(np.abs(d) < _NEGLIGIBLE, 0.0, d)
+    d = d / np.linalg.norm(d)
+    return d * np.sign(d[np.argmax(np.abs(d))])
+
+
+def _words(direction: Array, reference: str, member: str) -> str:
+    parts = []
+    for kind, vector in (("rotation about", direction[:3]), ("offset along", direction[3:])):
+        if np.any(vector):
+            parts.append(f"{kind} {_axis_words(vector)} of {reference}")
+    coupled = " together with " if len(parts) == 2 else ""
+    return f"{member}: {coupled.join(parts)}"
+
+
+def _axis_words(vector: Array) -> str:
+    unit = vector / np.linalg.norm(vector)
+    main = int(np.argmax(np.abs(unit)))
+    if abs(unit[main]) > np.cos(np.deg2rad(2.0)):
+        return "xyz"[main]
+    return "the direction (" + ", ".join(f"{u:+.2f}" for u in unit) + ")"
+
+
+def _remedy(direction: Array, all_open: Sequence[Array], turns: Array) -> str:
+    translations = sum(not np.any(d[:3]) for d in all_open)
+    if np.any(direction[:3]):
+        return "Move in a second direction, or turn about a second axis."
+    if translations >= 2:
+        return "Turn through at least 60 degrees, to both sides."
+    spread = np.linalg.svd(turns, compute_uv=False) if len(turns) else np.zeros(3)
+    if spread[0] > 0 and len(turns):
+        return "Record where waves (or a ramp, or a crane) roll and pitch the vehicle by some degrees."
+    return "Turn about a second axis."

@@ -1,0 +1,116 @@
+"""A trajectory as a function of time: cubic interpolation on SE(3), and where it may be asked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigwake.geometry.se3 import SE3
+from rigwake.geometry.so3 import Array, hat
+from rigwake.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """Where a trajectory is at N asked times.
+
+    world_from_body: N transforms. twists: (N, 6) body velocities `[rad/s, m/s]`.
+    segments: (N,) int, -1 where the trajectory says nothing (outside it, inside a gap or between segments).
+    """
+
+    world_from_body: SE3
+    twists: Array
+    segments: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A trajectory prepared for repeated interpolation.
+
+    Between neighbouring poses j and j+1 the body follows `V_j exp(f(a))`, f the cubic Hermite polynomial in
+    the tangent space at V_j with the velocities of both poses (Catmull-Rom); it passes through every pose.
+
+    start_ns: the stamp that `times_s` counts from. increments: (N-1, 6) `log(V_j^-1 V_j+1)`.
+    """
+
+    trajectory: Trajectory
+    start_ns: int
+    times_s: Array
+    increments: Array
+    twists: Array
+    period_s: float
+    max_gap_s: float
+
+    @classmethod
+    def of(cls, trajectory: Trajectory, max_gap_s: float | None = None) -> Curve:
+        """Prepare `trajectory`; gaps longer than `max_gap_s` (default: 10 median periods) are not bridged."""
+        times = trajectory.times_s
+        poses = trajectory.world_from_body
+        increments = (poses[:-1].inverse() * poses[1:]).log()
+        steps = np.diff(times)
+        period = float(np.median(steps))
+        longest = 10 * period if max_gap_s is None else max_gap_s
+        return cls(
+            trajectory,
+            int(trajectory.timestamps_ns[0]),
+            times,
+            increments,
+            _node_twists(increments, steps),
+            period,
+            longest,
+        )
+
+    @property
+    def segment_count(self) -> int:
+        """Number of segments, counted from 0 to the highest id."""
+        assert self.trajectory.segment_ids is not None
+        return int(self.trajectory.segment_ids.max()) + 1
+
+    def at(self, times_s: Array) -> Sampled:
+        """Interpolate at `times_s`, seconds after `start_ns`; times within a microsecond of a pose are that pose."""
+        times, n = self.times_s, len(self.times_s)
+        nearest = np.clip(np.searchsorted(times, times_s - 1e-6), 0, n - 1)
+        at_node = np.abs(times[nearest] - times_s) <= 1e-6
+        segment_ids = self.trajectory.segment_ids
+        assert segment_ids is not None
+        if at_node.all():
+            poses = self.trajectory.world_from_body[nearest]
+            return Sampled(poses, self.twists[nearest], segment_ids[nearest])
+        left = np.where(at_node, np.minimum(nearest, n - 2), np.clip(nearest - 1, 0, n - 2))
+        span = times[left + 1] - times[left]
+        alpha = np.clip((times_s - times[left]) / span, 0.0, 1.0)
+        alpha = np.where(at_node, (nearest > left) * 1.0, alpha)
+        poses = self.trajectory.world_from_body[left] * SE3.exp(self._hermite(left, alpha, span))
+        twists = self.twists[left] + alpha[:, None] * (self.twists[left + 1] - self.twists[left])
+        inside = (times_s >= times[0] - 1e-6) & (times_s <= times[-1] + 1e-6)
+        bridged = (span <= self.max_gap_s) & (segment_ids[left] == segment_ids[left + 1])
+        known = inside & (bridged | at_node)
+        return Sampled(poses, twists, np.where(known, segment_ids[nearest], -1))
+
+    def _hermite(self, left: NDArray[np.int64], alpha: Array, span: Array) -> Array:
+        a = alpha[:, None]
+        D = self.increments[left]
+        start = self.twists[left] * span[:, None]
+        end = self.twists[left + 1] * span[:, None]
+        end = end + 0.5 * np.einsum("nij,nj->ni", small_adjoint(D), end)  # J_r^-1(D) to first order
+        return D * (3 - 2 * a) * a * a + start * a * (1 - a) ** 2 - end * a * a * (1 - a)
+
+
+def small_adjoint(tangents: Array) -> Array:
+    """`ad(x)` with `ad(x) y = [x, y]`: (..., 6) -> (..., 6, 6)."""
+    ad = np.zeros((*tangents.shape, 6))
+    ad[..., :3, :3] = ad[..., 3:, 3:] = hat(tangents[..., :3])
+    ad[..., 3:, :3] = hat(tangents[..., 3:])
+    return ad
+
+
+def _node_twists(increments: Array, steps: Array) -> Array:
+    """Body velocities at the poses from both neighbouring increments (one-sided at the ends)."""
+    speed = increments / steps[:, None]
+    twists = np.empty((len(steps) + 1, 6))
+    twists[0], twists[-1] = speed[0], speed[-1]
+    before, after = steps[:-1, None], steps[1:, None]
+    twists[1:-1] = (speed[:-1] * after + speed[1:] * before) / (before + after)
+    return twists

@@ -1,0 +1,104 @@
+"""Time offset between two trajectories of one rigid body by correlating their speeds of rotation.
+
+The angular speed `|w|` is the same for every body that is bolted to the rig, whatever its mounting, origin
+and scale, so that the lag of the highest correlation aligns two clocks without any calibration (the standard
+first step of hand-eye tools; Furrer et al., *Evaluation of combined time-offset estimation and hand-eye
+calibration on robotic datasets*, 2018).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
+
+from rigwake.errors import UnobservableError
+from rigwake.geometry import so3
+from rigwake.geometry.so3 import Array
+from rigwake.trajectory import Trajectory
+
+MIN_OVERLAP = 0.3  # of the shorter trajectory: a short overlap correlates by chance
+MIN_CORRELATION = 0.5
+
+
+@dataclass(frozen=True)
+class TimeOffset:
+    """`t_reference = t_member + offset_s`, the correlation there (1 is perfect) and the shared seconds."""
+
+    offset_s: float
+    correlation: float
+    overlap_s: float
+
+
+def angular_speed(trajectory: Trajectory) -> tuple[Array, Array]:
+    """Mid times (N-1,), seconds since the first pose, and angular speeds (N-1,), rad/s; NaN across segments."""
+    R = trajectory.world_from_body.rotation
+    times = trajectory.times_s
+    angle = np.linalg.norm(so3.log(np.swapaxes(R[:-1], -1, -2) @ R[1:]), axis=-1)
+    speed = angle / np.diff(times)
+    assert trajectory.segment_ids is not None
+    speed[np.diff(trajectory.segment_ids) != 0] = np.nan
+    return (times[:-1] + times[1:]) / 2, speed
+
+
+def estimate_time_offset(reference: Trajectory, member: Trajectory) -> TimeOffset:
+    """The offset of `member`'s clock, to a fraction of a sample, for clocks that may be any time apart.
+
+    Both speeds are resampled to one grid, and the normalised correlation of every lag with enough overlap is
+    computed by FFT; a parabola through the peak refines it.
+
+    Raises UnobservableError if the rotation does not vary enough to tell the lag.
+    """
+    step = min(float(np.median(np.diff(t.timestamps_ns))) * 1e-9 for t in (reference, member))
+    step = max(step, max(reference.duration_s, member.duration_s) / 200_000)  # bounds memory
+    a, b = (_resampled_speed(t, step) for t in (reference, member))
+    lags, score, shared = _normalised_correlation(a, b)
+    best = int(np.argmax(score))
+    if not score[best] >= MIN_CORRELATION:
+        raise UnobservableError(
+            f"The angular speeds of {reference.name} and {member.name} do not match at any time offset "
+            f"(best correlation {max(score[best], 0.0):.2f}).",
+            consequence="Their clocks cannot be aligned.",
+            remedy="Record turns of varying speed, or declare the clocks synchronous (--no-time-offset).",
+        )
+    shift = 0.0
+    if 0 < best < len(score) - 1 and np.isfinite(score[best - 1 : best + 2]).all():
+        before, peak, after = score[best - 1 : best + 2]
+        curvature = before - 2 * peak + after
+        shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
+    starts = int(reference.timestamps_ns[0]) - int(member.timestamps_ns[0])
+    offset = starts * 1e-9 + (lags[best] + shift) * step
+    return TimeOffset(float(offset), float(score[best]), float(shared[best] * step))
+
+
+def _resampled_speed(trajectory: Trajectory, step_s: float) -> Array:
+    times, speed = angular_speed(trajectory)
+    known = np.isfinite(speed)
+    grid = np.arange(0.0, trajectory.duration_s + step_s / 2, step_s)
+    return np.asarray(np.interp(grid, times[known], speed[known]))
+
+
+def _normalised_correlation(a: Array, b: Array) -> tuple[NDArray[np.int64], Array, Array]:
+    """Pearson correlation of `a[i + lag]` with `b[i]` at every lag, -inf where they overlap too little."""
+    size = next_fast_len(len(a) + len(b) - 1, real=True)
+    lags = np.arange(-(len(b) - 1), len(a), dtype=np.int64)
+
+    def correlate(x: Array, y: Array) -> Array:
+        full = irfft(rfft(x, size) * np.conj(rfft(y, size)), size)
+        return np.asarray(full[lags])  # negative lags wrap around
+
+    a, b = a - a.mean(), b - b.mean()
+    ones_a, ones_b = np.ones_like(a), np.ones_like(b)
+    n = np.maximum(np.round(correlate(ones_a, ones_b)), 1.0)
+    sum_a, sum_b = correlate(a, ones_b), correlate(ones_a, b)
+    covariance = correlate(a, b) - sum_a * sum_b / n
+    variance_a = correlate(a * a, ones_b) - sum_a**2 / n
+    variance_b = correlate(ones_a, b * b) - sum_b**2 / n
+    # lags whose overlap holds hardly any variation correlate by rounding and chance
+    enough = n >= MIN_OVERLAP * min(len(a), len(b))
+    varied = (variance_a > 1e-2 * a.var() * n) & (variance_b > 1e-2 * b.var() * n) & (a.var() > 1e-12)
+    usable = enough & varied & (b.var() > 1e-12)
+    product = np.sqrt(np.where(usable, variance_a * variance_b, 1.0))
+    return lags, np.where(usable, covariance / product, -np.inf), n
