@@ -56,37 +56,57 @@ def bearing_angles(world_from_cam: SE3, points_world: Array, bearings_cam: Array
 
 
 @numba.njit(cache=True)
+def _tangents(b: Array, e: Array) -> None:
+    """Writes two unit vectors normal to b and to each other into e (2, 3) (Duff et al., JCGT 2017)."""
+    sign = 1.0 if b[2] >= 0 else -1.0
+    p = -1.0 / (sign + b[2])
+    q = b[0] * b[1] * p
+    e[0, 0], e[0, 1], e[0, 2] = 1.0 + sign * b[0] * b[0] * p, sign * q, -sign * b[0]
+    e[1, 0], e[1, 1], e[1, 2] = q, sign + b[1] * b[1] * p, -b[1]
+
+
+@numba.njit(cache=True)
 def _normal_equations(
     R: Array, c: Array, points: Array, bearings: Array, stds: Array, scale: float
 ) -> tuple[Array, Array, float]:
-    """J^T W J, J^T W r and the Cauchy cost of whitened residuals `u - b` tangent to the sphere at b.
+    """J^T W J, J^T W r and the Cauchy cost of the whitened components of `u` tangent to the sphere at `b`.
 
-    `u` is the direction to the point in the camera frame X / |X|; a right perturbation [w, v] of
-    world_from_cam moves X by `X x w - v`.
+    `u` is the direction to the point in the camera frame, X / |X|; a right perturbation [w, v] of
+    world_from_cam moves X by `X x w - v`. Points on the far side of the sphere cost, and do not pull.
     """
     H, g, cost = np.zeros((6, 6)), np.zeros(6), 0.0
-    J = np.zeros((3, 6))
+    X, u, row, e = np.zeros(3), np.zeros(3), np.zeros(6), np.zeros((2, 3))
     for n in range(len(points)):
-        X = R.T @ (points[n] - c)
-        norm = np.sqrt(X[0] ** 2 + X[1] ** 2 + X[2] ** 2)
-        u = X / max(norm, 1e-12)
+        d0, d1, d2 = points[n, 0] - c[0], points[n, 1] - c[1], points[n, 2] - c[2]
+        for i in range(3):
+            X[i] = R[0, i] * d0 + R[1, i] * d1 + R[2, i] * d2
+        norm = max(np.sqrt(X[0] ** 2 + X[1] ** 2 + X[2] ** 2), 1e-12)
         b = bearings[n]
-        along = u[0] * b[0] + u[1] * b[1] + u[2] * b[2]
-        # a direction on the far side keeps the full residual |u - b|, so that it never looks like an inlier
-        r = (u - b * along if along > 0 else u - b) / stds[n]
-        s = (r[0] ** 2 + r[1] ** 2 + r[2] ** 2) / scale**2
+        for i in range(3):
+            u[i] = X[i] / norm
+        if u[0] * b[0] + u[1] * b[1] + u[2] * b[2] <= 0:
+            cost += 0.5 * scale**2 * np.log1p(4.0 / (stds[n] * scale) ** 2)
+            continue
+        _tangents(b, e)
+        r0 = (e[0, 0] * u[0] + e[0, 1] * u[1] + e[0, 2] * u[2]) / stds[n]
+        r1 = (e[1, 0] * u[0] + e[1, 1] * u[1] + e[1, 2] * u[2]) / stds[n]
+        s = (r0 * r0 + r1 * r1) / scale**2
         weight = 1.0 / (1.0 + s)
         cost += 0.5 * scale**2 * np.log1p(s)
-        J[0, 0], J[0, 1], J[0, 2] = 0.0, -X[2], X[1]
-        J[1, 0], J[1, 1], J[1, 2] = X[2], 0.0, -X[0]
-        J[2, 0], J[2, 1], J[2, 2] = -X[1], X[0], 0.0
-        for i in range(3):
-            J[i, 3 + i] = -1.0
-        P = np.eye(3) - np.outer(u, u)
-        Q = np.eye(3) - np.outer(b, b) if along > 0 else np.eye(3)
-        K = Q @ (P @ J) / (max(norm, 1e-12) * stds[n])
-        H += weight * (K.T @ K)
-        g += weight * (K.T @ r)
+        for k in range(2):
+            r = r0 if k == 0 else r1
+            for i in range(3):
+                row[3 + i] = -(e[k, i] - r * stds[n] * u[i]) / (norm * stds[n])
+            row[0] = row[5] * X[1] - row[4] * X[2]
+            row[1] = row[3] * X[2] - row[5] * X[0]
+            row[2] = row[4] * X[0] - row[3] * X[1]
+            for i in range(6):
+                g[i] += weight * row[i] * r
+                for j in range(i, 6):
+                    H[i, j] += weight * row[i] * row[j]
+    for i in range(6):
+        for j in range(i):
+            H[i, j] = H[j, i]
     return H, g, cost
 
 

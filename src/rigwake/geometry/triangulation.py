@@ -110,6 +110,19 @@ def _nearest_point(origins: Array, directions: Array, weights: Array, lo: int, h
 
 
 @numba.njit(cache=True)
+def _direction(x: Array, origin: Array, out: Array) -> None:
+    d0, d1, d2 = x[0] - origin[0], x[1] - origin[1], x[2] - origin[2]
+    norm = max(np.sqrt(d0 * d0 + d1 * d1 + d2 * d2), 1e-18)
+    out[0], out[1], out[2] = d0 / norm, d1 / norm, d2 / norm
+
+
+@numba.njit(cache=True)
+def _angle(a: Array, b: Array) -> float:
+    x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    return float(np.arctan2(np.sqrt(x * x + y * y + z * z), a[0] * b[0] + a[1] * b[1] + a[2] * b[2]))
+
+
+@numba.njit(cache=True)
 def _triangulate(
     origins: Array, directions: Array, starts: Indices, rounds: int
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
@@ -119,6 +132,7 @@ def _triangulate(
     rms = np.full(count, np.inf)
     ahead = np.zeros(count, dtype=np.bool_)
     weights = np.ones(len(origins))
+    first, ray = np.zeros(3), np.zeros(3)
     for p in range(count):
         lo, hi = starts[p], starts[p + 1]
         if hi - lo < 2:
@@ -128,25 +142,21 @@ def _triangulate(
             if not fixed:
                 break
             for k in range(lo, hi):
-                d = x - origins[k]
-                weights[k] = 1.0 / max(d[0] ** 2 + d[1] ** 2 + d[2] ** 2, 1e-18)
+                o = origins[k]
+                squared = (x[0] - o[0]) ** 2 + (x[1] - o[1]) ** 2 + (x[2] - o[2]) ** 2
+                weights[k] = 1.0 / max(squared, 1e-18)
             x, fixed = _nearest_point(origins, directions, weights, lo, hi)
         if not fixed:
             continue
         points[p] = x
-        first = x - origins[lo]
-        first /= max(np.sqrt((first * first).sum()), 1e-18)
+        _direction(x, origins[lo], first)
         squares, all_ahead = 0.0, True
         for k in range(lo, hi):
-            ray = x - origins[k]
-            ray /= max(np.sqrt((ray * ray).sum()), 1e-18)
-            along = (ray * directions[k]).sum()
-            across = np.cross(ray, directions[k])
-            squares += np.arctan2(np.sqrt((across * across).sum()), along) ** 2
-            all_ahead = all_ahead and along > 0
-            turn = np.cross(first, ray)
-            angle = np.arctan2(np.sqrt((turn * turn).sum()), (first * ray).sum())
-            parallax[p] = max(parallax[p], angle)
+            _direction(x, origins[k], ray)
+            angle = _angle(ray, directions[k])
+            squares += angle * angle
+            all_ahead = all_ahead and angle < 0.5 * np.pi
+            parallax[p] = max(parallax[p], _angle(first, ray))
         rms[p] = np.sqrt(squares / (hi - lo))
         ahead[p] = all_ahead
     return points, parallax, rms, ahead
