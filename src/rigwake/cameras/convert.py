@@ -8,7 +8,7 @@ import numpy as np
 
 from rigwake.cameras.base import CameraModel
 from rigwake.cameras.catalogue import camera_class
-from rigwake.cameras.lens import Lens
+from rigwake.cameras.lens import Lens, axis_focal_px
 from rigwake.errors import CameraError
 from rigwake.geometry.so3 import Array
 
@@ -41,9 +41,8 @@ def convert_camera(camera: CameraModel, model: str, max_angle: float | None = No
     ceiling = target.angle_ceiling if target.angle_ceiling > np.pi / 2 else np.pi / 2 - _CEILING_MARGIN
     reach = min(camera.max_angle, ceiling if max_angle is None else min(max_angle, target.angle_ceiling))
     bearings, pixels = _image_rays(camera, reach)
-    axis = camera.project_with_jacobians(np.array([[0.0, 0.0, 1.0]]))
-    focal = float(np.sqrt(abs(np.linalg.det(axis.d_point[0, :, :2]))))
-    start = target(target.nominal_values(focal, *axis.pixels[0].tolist()), camera.width_px, camera.height_px)
+    cx, cy = camera.project(np.array([[0.0, 0.0, 1.0]]))[0][0].tolist()
+    start = target(target.nominal_values(axis_focal_px(camera), cx, cy), camera.width_px, camera.height_px)
     fitted = _fit(start, bearings, pixels)
     end = min(reach, fitted.max_angle)
     final = target(fitted.values, camera.width_px, camera.height_px, end)

@@ -33,7 +33,7 @@ from rigwake.errors import CameraError, InputError, UsageError
 Cameras = dict[str, CameraModel]
 
 _MAX_FILE_BYTES = 20_000_000
-_HEADER = """\
+HEADER = """\
 # Cameras by name, as rigwake knows them: docs/cameras.md tells the equation and the parameters of every model.
 # Pixel (0, 0) is the centre of the top-left pixel. max_angle_deg: where the lens ends, if that is known.
 """
@@ -170,7 +170,7 @@ def _basalt_text(cameras: Cameras) -> str:
 
 def cameras_to_text(cameras: Mapping[str, CameraModel]) -> str:
     """This project's YAML of cameras by name."""
-    return _HEADER + _yaml({"cameras": {name: camera_to_dict(camera) for name, camera in cameras.items()}})
+    return HEADER + _yaml({"cameras": {name: camera_to_dict(camera) for name, camera in cameras.items()}})
 
 
 WRITERS: dict[str, Callable[[Cameras], str]] = {

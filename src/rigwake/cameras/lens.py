@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigwake.cameras.base import Mask, Projection
+from rigwake.cameras.base import CameraModel, Mask, Projection
 from rigwake.cameras.kernels import Kernels
 from rigwake.errors import CameraError
 from rigwake.geometry.so3 import Array
@@ -144,6 +144,12 @@ def _rows(values: ArrayLike, columns: int, name: str) -> Array:
     if rows.ndim != 2 or rows.shape[1] != columns:
         raise CameraError(f"{name} must have shape (N, {columns}), got {rows.shape}.")
     return rows
+
+
+def axis_focal_px(camera: CameraModel) -> float:
+    """Pixels per radian at the optical axis, whatever the model calls its focal length."""
+    at_axis = camera.project_with_jacobians(np.array([[0.0, 0.0, 1.0]])).d_point[0, :, :2]
+    return float(np.sqrt(abs(np.linalg.det(at_axis))))
 
 
 def quotient_slope(angles: Array, below: Array, below_slope: Array) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake.cameras.base import CameraModel, Mask
+from rigwake.cameras.lens import axis_focal_px
 from rigwake.cameras.pinhole import Pinhole
 from rigwake.errors import CameraError
 from rigwake.geometry.so3 import Array
@@ -159,8 +160,7 @@ def covering_views(
     reaches it. focal_px: by default that of the lens at its axis, so that no detail is lost there.
     """
     if focal_px is None:
-        axis = camera.project_with_jacobians(np.array([[0.0, 0.0, 1.0]]))
-        focal_px = float(np.sqrt(abs(np.linalg.det(axis.d_point[0, :, :2]))))
+        focal_px = axis_focal_px(camera)
     if camera.max_angle <= _ONE_VIEW_ANGLE:
         faces, half = {"front": np.eye(3)}, camera.max_angle
     else:

@@ -63,16 +63,16 @@ class NormalEquations:
         diagonal = np.einsum("vii->vi", self.views)
         views = self.views + damping * np.einsum("vi,ij->vij", diagonal + 1e-12, np.eye(6))
         right = np.concatenate([np.swapaxes(self.coupling, 1, 2), self.view_gradients[..., None]], axis=2)
-        solved = np.linalg.solve(views, right)
+        solved: Array = np.linalg.solve(views, right)
         camera = self.camera + damping * np.diag(np.diag(self.camera) + 1e-12)
         S: Array = camera - np.einsum("vpi,viq->pq", self.coupling, solved[..., :-1])
         g: Array = self.camera_gradient - np.einsum("vpi,vi->p", self.coupling, solved[..., -1])
-        return S, g, np.asarray(solved)
+        return S, g, solved
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Steps of the camera's free parameters (P,) and of the poses (V, 6)."""
         S, g, solved = self.reduced(damping)
-        camera = -np.linalg.solve(S, g)
+        camera: Array = -np.linalg.solve(S, g)
         return camera, -solved[..., -1] - np.einsum("vip,p->vi", solved[..., :-1], camera)
 
 

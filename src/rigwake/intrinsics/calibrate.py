@@ -9,6 +9,7 @@ import numpy as np
 
 from rigwake.cameras.base import CameraModel, Mask
 from rigwake.cameras.catalogue import camera_class
+from rigwake.cameras.lens import axis_focal_px
 from rigwake.errors import EstimationError, UnobservableError, UsageError
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
@@ -222,12 +223,6 @@ def _covariance(
     covariance = np.zeros((len(free), len(free)))
     covariance[np.ix_(free, free)] = block
     return covariance, tuple(np.array(camera.param_names)[free][lost].tolist())
-
-
-def axis_focal_px(camera: CameraModel) -> float:
-    """Pixels per radian at the optical axis, whatever the model calls its focal length."""
-    at_axis = camera.project_with_jacobians(np.array([[0.0, 0.0, 1.0]])).d_point[0, :, :2]
-    return float(np.sqrt(abs(np.linalg.det(at_axis))))
 
 
 def axis_focal_std_px(camera: CameraModel, covariance: Array) -> float:

@@ -40,9 +40,10 @@ def _coverage(result: IntrinsicCalibration) -> Figure:
     axes = figure.add_subplot()
     corners = result.corners
     used = corners.used
-    axes.scatter(*corners.pixels[used].T, s=3, c=corners.view_index[used], cmap="turbo", label="used")
+    columns, rows = corners.pixels.T
+    axes.scatter(columns[used], rows[used], s=3, c=corners.view_index[used], cmap="turbo", label="used")
     if not used.all():
-        axes.scatter(*corners.pixels[~used].T, s=22, marker="x", color="red", label="dropped")
+        axes.scatter(columns[~used], rows[~used], s=22, marker="x", color="red", label="dropped")
     circle = _circle_at(result, result.max_observed_angle)
     axes.plot(
         *circle.T, color="black", lw=1, label=f"{np.rad2deg(result.max_observed_angle):.1f} deg off axis"

@@ -1,0 +1,157 @@
+"""`rigwake intrinsics`: a camera's lens from images of a board."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from rigwake.cli.console import next_step, out, progress_bar, write_json
+from rigwake.errors import UsageError
+
+if TYPE_CHECKING:
+    from rigwake.intrinsics.calibrate import IntrinsicCalibration
+    from rigwake.intrinsics.observations import BoardObservations
+    from rigwake.intrinsics.select import ModelScore
+
+
+def command(
+    images: Annotated[
+        list[Path], typer.Argument(help="Images, folders of images, or one csv file of detected corners.")
+    ],
+    board: Annotated[
+        str | None,
+        typer.Option(
+            help="chessboard:9x6:0.03 (inner corners), aprilgrid:6x6:0.088:0.3, charuco:11x8:0.03:0.022."
+        ),
+    ] = None,
+    model: Annotated[
+        str,
+        typer.Option(
+            help="pinhole, rational, kb4, kb23, mei, scaramuzza, eucm, ds, fov; `auto` compares them."
+        ),
+    ] = "auto",
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Write the camera file here.")] = None,
+    name: Annotated[str | None, typer.Option(help="The camera's name in the file.")] = None,
+    image_size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT, needed with a csv file.")] = None,
+    fov: Annotated[
+        float | None, typer.Option(help="The lens's full field of view in degrees, if known.")
+    ] = None,
+    fix: Annotated[str, typer.Option(help="Parameters to hold, comma-separated: `skew,k3`.")] = "",
+    free: Annotated[str, typer.Option(help="Parameters to estimate though they are held by default.")] = "",
+    plots: Annotated[Path | None, typer.Option(help="Folder for the coverage and residual plots.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the result to this file ('-': print).")
+    ] = None,
+) -> None:
+    """A camera's lens from images of a board, for pinholes and for fisheyes beyond 180 degrees.
+
+    Example: [cyan]rigwake intrinsics images/ --board aprilgrid:6x6:0.088:0.3 --model kb4 -o front.yaml[/cyan]
+    """
+    from rigwake.intrinsics.calibrate import calibrate
+    from rigwake.intrinsics.plots import save_plots
+    from rigwake.intrinsics.result_file import calibration_to_dict, save_intrinsics
+    from rigwake.intrinsics.select import choose
+
+    camera_name = name or (output.stem if output else "camera")
+    observations = _observe(images, board, image_size)
+    scores = _compare(observations) if model == "auto" else []
+    result = calibrate(
+        observations,
+        choose(scores) if model == "auto" else model,
+        fix=_names(fix),
+        free=_names(free),
+        max_angle=None if fov is None else float(np.deg2rad(fov / 2)),
+    )
+    content = calibration_to_dict(result, observations.unused, scores)
+    if output is not None:
+        save_intrinsics(output, camera_name, content)
+    written = save_plots(result, plots, camera_name) if plots is not None else []
+    if json_file is not None:
+        write_json(json_file, {camera_name: content})
+        if str(json_file) == "-":
+            return
+    _print(result, observations, scores)
+    for path in [*([output] if output else []), *written]:
+        out.print(f"written: {path}")
+    if output is None:
+        next_step("rigwake intrinsics ... -o FILE.yaml", "write the camera to a file")
+    else:
+        next_step(f"rigwake calibrate REC --cameras {output} -o OUT", "calibrate the rig with this camera")
+
+
+def _names(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def _observe(images: list[Path], board: str | None, image_size: str | None) -> BoardObservations:
+    from rigwake.intrinsics.boards import parse_board
+    from rigwake.intrinsics.detect import detect_board, list_images
+    from rigwake.intrinsics.observations import read_corner_file
+
+    if any(path.name.endswith((".csv", ".csv.gz")) for path in images):
+        if len(images) > 1:
+            raise UsageError("One csv file of corners is read at a time.")
+        width_px, height_px = _size(image_size)
+        return read_corner_file(images[0], width_px, height_px)
+    if board is None:
+        raise UsageError("Images need a board.", remedy="Add --board, as chessboard:9x6:0.03.")
+    parsed, files = parse_board(board), list_images(images)
+    with progress_bar() as bar:
+        task = bar.add_task(f"looking for the {parsed.words}", total=len(files))
+        return detect_board(parsed, files, progress=lambda: bar.advance(task))
+
+
+def _size(text: str | None) -> tuple[int, int]:
+    if text is None:
+        raise UsageError("A csv file of corners needs the image size.", remedy="Add --image-size 752x480.")
+    try:
+        width_px, height_px = (int(word) for word in text.lower().split("x"))
+    except ValueError:
+        raise UsageError(f"--image-size {text!r} is not WIDTHxHEIGHT.", remedy="Write 752x480.") from None
+    return width_px, height_px
+
+
+def _compare(observations: BoardObservations) -> list[ModelScore]:
+    from rigwake.intrinsics.select import CANDIDATES, cross_validate
+
+    with progress_bar() as bar:
+        task = bar.add_task("comparing models (the first run compiles them)", total=len(CANDIDATES))
+        return cross_validate(observations, progress=lambda: bar.advance(task))
+
+
+def _print(result: IntrinsicCalibration, observations: BoardObservations, scores: list[ModelScore]) -> None:
+    if scores:
+        table = Table(title="cross-validation: held-out views")
+        for heading in ("model", "RMS px", "± px", "free parameters", ""):
+            table.add_column(heading, justify="left" if heading in ("model", "") else "right")
+        for score in sorted(scores, key=lambda s: s.held_out_px):
+            chosen = "chosen" if score.model == result.camera.model else score.failure
+            figures = (
+                ("–", "–") if score.failure else (f"{score.held_out_px:.4f}", f"{score.std_error_px:.4f}")
+            )
+            table.add_row(score.model, *figures, str(score.free_count), chosen)
+        out.print(table)
+    table = Table(title=f"{result.camera.model}, {result.camera.width_px} x {result.camera.height_px} px")
+    for heading in ("parameter", "value", "± 1 sigma"):
+        table.add_column(heading, justify="left" if heading == "parameter" else "right")
+    for (parameter, std), value in zip(result.stds.items(), result.camera.params.tolist(), strict=True):
+        doubt = (
+            "held" if parameter in result.fixed else f"{std:.3g}" if np.isfinite(std) else "not determined"
+        )
+        table.add_row(parameter, f"{value:.8g}" if np.isfinite(std) else "–", doubt)
+    out.print(table)
+    out.print(
+        f"{result.corners.used.sum()} corners in {len(result.view_names)} views to "
+        f"{np.rad2deg(result.max_observed_angle):.1f} deg off the axis: RMS {result.rms_px:.4f} px, "
+        f"noise {result.sigma_px:.4f} px per coordinate; {result.dropped_corners} corners left out"
+    )
+    for view, reason in (*result.dropped_views, *observations.unused):
+        out.print(f"left out: {view}: {reason}", highlight=False)
+    if result.undetermined:
+        out.print(f"[yellow]not determined by these views: {', '.join(result.undetermined)}[/yellow]")
+    if not result.converged:
+        out.print("[yellow]the refinement had not converged: add views or fix parameters[/yellow]")
