@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from rigwake.cameras.base import Mask
@@ -26,6 +27,8 @@ def corner_strength(image: Image) -> NDArray[np.float32]:
 
 def _rank_in_group(groups: NDArray[np.int64]) -> NDArray[np.int64]:
     """Position of each element among the elements of its group, in order of appearance."""
+    if len(groups) == 0:
+        return groups
     order = np.argsort(groups, kind="stable")
     sorted_groups = groups[order]
     starts = np.flatnonzero(np.r_[True, sorted_groups[1:] != sorted_groups[:-1]])
@@ -51,27 +54,48 @@ def detect_corners(
     Cells that hold the fewest points are served first; within a cell the strongest corner wins.
     """
     strength = corner_strength(image)
-    size = 2 * min_distance_px + 1
-    peaks = strength >= cv2.dilate(strength, np.ones((size, size), np.uint8))
-    peaks &= usable & (strength > min_strength)
-    if len(occupied):
-        free = np.full(usable.shape, 255, np.uint8)
-        for x, y in np.rint(occupied).astype(int):
-            cv2.circle(free, (int(x), int(y)), min_distance_px, 0, -1)
-        peaks &= free > 0
-    rows, columns = np.nonzero(peaks)
+    peaks = (strength >= cv2.dilate(strength, np.ones((3, 3), np.uint8))) & (strength > min_strength)
+    rows, columns = np.nonzero(peaks & usable)
     order = np.lexsort((columns, rows, -strength[rows, columns]))
+    free = np.ones(usable.shape, dtype=np.bool_)
+    _claim(
+        free,
+        np.rint(occupied[:, 1]).astype(np.int64),
+        np.rint(occupied[:, 0]).astype(np.int64),
+        min_distance_px,
+    )
+    order = order[_claim(free, rows[order], columns[order], min_distance_px)]
     rows, columns = rows[order], columns[order]
+    candidates = np.stack([columns, rows], axis=1).astype(np.float64)
+    return candidates[balanced(candidates, occupied, image.shape[1], cell_px)[:wanted]]
 
-    cells_across = -(-image.shape[1] // cell_px)
-    cells = (rows // cell_px) * cells_across + columns // cell_px
-    rank = _rank_in_group(cells.astype(np.int64))
-    if len(occupied):
-        inside = np.clip(np.rint(occupied).astype(int), 0, np.array(image.shape[::-1]) - 1)
-        taken = np.bincount(
-            (inside[:, 1] // cell_px) * cells_across + inside[:, 0] // cell_px,
-            minlength=cells_across * (-(-image.shape[0] // cell_px)),
-        )
-        rank = rank + taken[cells]
-    chosen = np.argsort(rank, kind="stable")[:wanted]
-    return np.stack([columns[chosen], rows[chosen]], axis=1).astype(np.float64)
+
+@njit(cache=True, nogil=True)
+def _claim(free: Mask, rows: NDArray[np.int64], columns: NDArray[np.int64], reach: int) -> Mask:
+    """Which points (N,), in order, find their pixel free; each claims all pixels nearer than `reach`."""
+    height, width = free.shape
+    claimed = np.zeros(len(rows), np.bool_)
+    for i in range(len(rows)):
+        y, x = rows[i], columns[i]
+        if not (0 <= y < height and 0 <= x < width and free[y, x]):
+            continue
+        claimed[i] = True
+        for v in range(max(y - reach, 0), min(y + reach + 1, height)):
+            for u in range(max(x - reach, 0), min(x + reach + 1, width)):
+                if (v - y) ** 2 + (u - x) ** 2 < reach * reach:
+                    free[v, u] = False
+    return claimed
+
+
+def balanced(candidates: Array, occupied: Array, width_px: int, cell_px: int) -> NDArray[np.int64]:
+    """Order (N,) in which to take candidates (N, 2), best first within a cell of the grid, so that cells fill
+    evenly; `occupied` (P, 2) are points that are there already."""
+    across = -(-width_px // cell_px)
+    cells, taken = (
+        (np.maximum(points[:, 1], 0).astype(np.int64) // cell_px) * across
+        + np.clip(points[:, 0], 0, width_px - 1).astype(np.int64) // cell_px
+        for points in (candidates, occupied)
+    )
+    size = int(max(cells.max(initial=0), taken.max(initial=0))) + 1
+    rank = _rank_in_group(cells) + np.bincount(taken, minlength=size)[cells]
+    return np.argsort(rank, kind="stable")

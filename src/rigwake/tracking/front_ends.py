@@ -5,13 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake.cameras.base import CameraModel, Mask
 from rigwake.errors import UsageError
 from rigwake.geometry.so3 import Array
 from rigwake.recording import CameraStream, Image
+from rigwake.tracking.descriptor_front_end import DescriptorFrontEnd
 from rigwake.tracking.klt_front_end import KltFrontEnd, Observed
 from rigwake.tracking.masks import CameraMask, HorizonMask, beyond_lens
 from rigwake.tracking.options import TrackingOptions
@@ -43,11 +46,9 @@ def track_camera(
             consequence="Pixels cannot be turned into bearings.",
             remedy="Give a model for it, or calibrate one with `rigwake intrinsics`.",
         )
-    usable = ~beyond_lens(stream.model)
-    if mask is not None:
-        usable &= mask.usable
+    usable = _static_region(stream.model, options, mask)
     chosen = np.arange(len(stream)) if indices is None else np.asarray(indices)
-    front_end = KltFrontEnd(stream.model, options)
+    front_end = _front_end(stream.model, options)
     last_ns: int | None = None
     horizon = None if up_cam is None else HorizonMask(stream.model)
     run = _Run()
@@ -67,6 +68,33 @@ def track_camera(
         if progress is not None:
             progress(done + 1)
     return run.tracks(stream, chosen, time.perf_counter() - started)
+
+
+class FrontEnd(Protocol):
+    """Follows points through consecutive images of one camera."""
+
+    def forget(self) -> None:
+        """Start anew: the next image does not continue the last one."""
+
+    def step(self, image: Image, usable: Mask) -> Observed:
+        """Observations in the next image; `usable` (H, W) says where points may be."""
+
+
+def _front_end(model: CameraModel, options: TrackingOptions) -> FrontEnd:
+    return KltFrontEnd(model, options) if options.front_end == "klt" else DescriptorFrontEnd(options)
+
+
+def _static_region(model: CameraModel, options: TrackingOptions, mask: CameraMask | None) -> Mask:
+    """Where points may be in every frame."""
+    usable = ~beyond_lens(model)
+    if mask is not None:
+        usable &= mask.usable
+    if options.region_of_interest is not None:
+        x, y, width, height = options.region_of_interest
+        within = np.zeros_like(usable)
+        within[max(y, 0) : max(y + height, 0), max(x, 0) : max(x + width, 0)] = True
+        usable &= within
+    return usable
 
 
 @dataclass

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from rigwake.errors import UsageError
 
+MatcherName = Literal["brute-force", "flann"]
 FrontEndName = Literal["klt", "sift", "fast-brief", "orb"]
 
 
@@ -25,6 +26,10 @@ class TrackingOptions:
     min_correlation: with the reference patch, under which a point is lost. max_std_px: predicted standard
         deviation of an observation, above which a point is lost. max_stretch: a patch drawn larger or smaller
         than its reference by more ends; the point may be found anew, as another track.
+    matcher, max_ratio: how the other front ends match descriptors, and Lowe's ratio: a match must be closer than
+        this share of the distance to the second best. memory: frames for which a point that was not matched is
+        remembered. min_displacement_px, max_displacement_px: matches that moved less or more are dropped.
+    region_of_interest: x, y, width, height of the part of the image to use, pixels; None is all.
     max_gap_s: points are not followed across a longer gap between usable frames.
     """
 
@@ -33,7 +38,7 @@ class TrackingOptions:
     redetect_below: float = 0.8
     redetect_every: int = 5
     cell_px: int = 40
-    min_distance_px: int = 8
+    min_distance_px: int = 6
     window_px: int = 21
     levels: int = 4
     max_forward_backward_px: float = 1.0
@@ -42,9 +47,21 @@ class TrackingOptions:
     min_correlation: float = 0.93
     max_std_px: float = 0.2
     max_stretch: float = 1.8
+    matcher: MatcherName = "brute-force"
+    max_ratio: float = 0.8
+    memory: int = 3
+    min_displacement_px: float = 0.0
+    max_displacement_px: float = 100.0
+    region_of_interest: tuple[int, int, int, int] | None = None
     max_gap_s: float = 0.6
 
     def __post_init__(self) -> None:
+        for name, known in (("front_end", get_args(FrontEndName)), ("matcher", get_args(MatcherName))):
+            if getattr(self, name) not in known:
+                raise UsageError(
+                    f"No {name.replace('_', ' ')} {getattr(self, name)!r}.",
+                    remedy=f"There are: {', '.join(known)}.",
+                )
         for name in ("max_features", "cell_px", "min_distance_px", "window_px", "levels"):
             if getattr(self, name) < 1:
                 raise UsageError(f"tracking option {name} must be at least 1, not {getattr(self, name)}.")
