@@ -1,0 +1,264 @@
+"""Pictures: every sub-pixel's ray through the lens itself, into the scene, and once more off the water."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import NDArray
+
+from rigwake.cameras.base import CameraModel
+from rigwake.geometry.se3 import SE3
+from rigwake.geometry.so3 import Array
+from rigwake.simulate import shading
+from rigwake.simulate.hull import Hull
+from rigwake.simulate.light import Sky, bake_irradiance, build_embree, build_sky, sky_light
+from rigwake.simulate.meshes import Floats
+from rigwake.simulate.scenario import Weather
+from rigwake.simulate.scenery import Scenery
+from rigwake.simulate.shading import Mirrored, Rays, Surfaces, Water
+from rigwake.simulate.structures import hull_mesh
+from rigwake.simulate.textures import Atlas
+from rigwake.simulate.waves import TILE_CELLS, WaveField
+
+_CHUNK = 1 << 17
+_LEVELS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One camera's rays, ready to be turned into the world: all sub-pixels that do not see the own hull.
+
+    cam_rays: (N, 3) unit. pixel, row: (N,) which pixel, which image row. width: (N,) radians across.
+    The hull's sub-pixels: colour, normal in the rig frame, light of the sky, pixel.
+    """
+
+    rig_from_cam: SE3
+    shape: tuple[int, int]
+    samples: int
+    cam_rays: Floats
+    pixel: NDArray[np.int32]
+    row: NDArray[np.int32]
+    width: Floats
+    hull_albedo: Floats
+    hull_normal: Floats
+    hull_light: Floats
+    hull_pixel: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class TruthImage:
+    """What is in each pixel's centre. labels: (H, W) uint8, 0 outside the image circle, 60 land, 120 sky,
+    180 water, 240 own hull. ranges_m: (H, W) float32 distance along the ray, inf for sky, NaN outside and hull."""
+
+    labels: NDArray[np.uint8]
+    ranges_m: Floats
+
+
+class Renderer:
+    """A scene under a sky on a sea, ready to be looked at from anywhere. Safe to share between threads."""
+
+    def __init__(self, scenery: Scenery, sea: WaveField, weather: Weather, seed: int) -> None:
+        self.sea = sea
+        self.sky = build_sky(weather, seed)
+        self.atlas = scenery.atlas
+        self.embree = build_embree(scenery.mesh)
+        light = bake_irradiance(scenery.mesh, self.embree, self.sky)
+        mesh = scenery.mesh
+        self.surfaces = _surfaces(
+            mesh.uv, mesh.texture, mesh.tint, mesh.normals(), light, scenery.atlas, self.sky
+        )
+
+    def view(self, model: CameraModel, rig_from_cam: SE3, hull: Hull, samples: int) -> View:
+        """Prepare a camera with `samples` rays per pixel (a square number), the hull traced once."""
+        side = round(np.sqrt(samples))
+        offsets = (np.arange(side) + 0.5) / side - 0.5
+        rays, pixel, width = [], [], []
+        for dv in offsets:
+            for du in offsets:
+                part = _lens_rays(model, du, dv)
+                rays.append(part[0])
+                pixel.append(part[1])
+                width.append(part[2] / side)
+        # sub-pixels of one pixel side by side: neighbouring rays hit the same triangles
+        all_pixels = np.concatenate(pixel)
+        order = np.argsort(all_pixels, kind="stable")
+        cam_rays = np.concatenate(rays)[order]
+        all_pixels, widths = all_pixels[order], np.concatenate(width)[order]
+        hull_hit, colour, normal, light = self._trace_hull(hull, rig_from_cam, cam_rays, widths)
+        free = ~hull_hit
+        return View(
+            rig_from_cam,
+            (model.height_px, model.width_px),
+            side * side,
+            cam_rays[free],
+            all_pixels[free],
+            (all_pixels[free] // model.width_px).astype(np.int32),
+            widths[free],
+            colour,
+            normal,
+            light,
+            all_pixels[hull_hit],
+        )
+
+    def _trace_hull(
+        self, hull: Hull, rig_from_cam: SE3, cam_rays: Floats, widths: Floats
+    ) -> tuple[NDArray[np.bool_], Floats, Floats, Floats]:
+        mesh = hull_mesh(hull, self.atlas)
+        embree = build_embree(mesh)
+        light = sky_light(mesh, embree, self.sky)
+        surfaces = _surfaces(mesh.uv, mesh.texture, mesh.tint, mesh.normals(), light, self.atlas, self.sky)
+        directions = (cam_rays @ rig_from_cam.rotation.T).astype(np.float32)
+        hit = _cast(embree, np.broadcast_to(np.float32(rig_from_cam.translation), directions.shape), directions)
+        seen = hit["primID"] >= 0
+        triangle, u, v = hit["primID"][seen], hit["u"][seen], hit["v"][seen]
+        colour = np.empty((len(triangle), 3), np.float32)
+        shading.surface_colours(surfaces, triangle, u, v, hit["tfar"][seen] * widths[seen], colour)
+        corner = np.stack([1 - u - v, u, v], 1)
+        lit = np.einsum("nc,nca->na", corner, light[triangle]).astype(np.float32)
+        return seen, colour, surfaces.normal[triangle], lit
+
+    def water(self, time_s: float) -> Water:
+        """The sea at a time, with its mip levels."""
+        return _water(self.sea, time_s)
+
+    def render(self, view: View, world_from_rig: SE3, water: Water) -> Floats:
+        """Linear radiance (H, W, 3) RGB. world_from_rig: a transform per image row (H,), or one for all.
+
+        The hull turns with the rig; its light is that of the middle row.
+        """
+        height, width = view.shape
+        image = np.zeros((height * width, 3), np.float32)
+        rotation, centre = _per_row(view, world_from_rig)
+        for start in range(0, len(view.pixel), _CHUNK):
+            rays = self._shoot(view, slice(start, start + _CHUNK), rotation, centre)
+            out = _empty_mirrored(len(rays.pixel))
+            count = shading.shade(self.surfaces, water, rays, out, image)
+            if count:
+                thrown = Mirrored(*(array[:count] for array in out))
+                hit = self.embree.run(thrown.origin, thrown.direction, output=True)
+                shading.shade_mirrored(
+                    self.surfaces, thrown, hit["tfar"], hit["primID"], hit["u"], hit["v"], image
+                )
+        middle = rotation[height // 2] @ view.rig_from_cam.rotation.T
+        sun_rig = middle.T @ self.sky.sun
+        shading.shade_hull(view.hull_albedo, view.hull_normal, view.hull_light, view.hull_pixel, sun_rig, image)
+        return np.asarray(image.reshape(height, width, 3) / view.samples, np.float32)
+
+    def truth(self, view: View, world_from_rig: SE3, water: Water) -> TruthImage:
+        """Labels and ranges of a view prepared with one ray per pixel."""
+        height, width = view.shape
+        labels = np.zeros(height * width, np.uint8)
+        ranges = np.full(height * width, np.nan, np.float32)
+        labels[view.hull_pixel] = shading.HULL
+        rotation, centre = _per_row(view, world_from_rig)
+        for start in range(0, len(view.pixel), _CHUNK):
+            rays = self._shoot(view, slice(start, start + _CHUNK), rotation, centre)
+            shading.classify(water, rays, labels, ranges)
+        return TruthImage(labels.reshape(height, width), ranges.reshape(height, width))
+
+    def _shoot(self, view: View, part: slice, rotation: Array, centre: Array) -> Rays:
+        rays = view.cam_rays[part]
+        origin, direction = np.empty_like(rays), np.empty_like(rays)
+        shading.aim(rays, view.row[part], rotation, centre, origin, direction)
+        hit = self.embree.run(origin, direction, output=True)
+        return Rays(
+            origin,
+            direction,
+            view.pixel[part],
+            view.width[part],
+            hit["tfar"],
+            hit["primID"],
+            hit["u"],
+            hit["v"],
+        )
+
+
+def _surfaces(
+    uv: Floats, texture: NDArray[np.int32], tint: Floats, normal: Floats, light: Floats, atlas: Atlas, sky: Sky
+) -> Surfaces:
+    return Surfaces(
+        uv,
+        texture,
+        np.ascontiguousarray(tint),
+        normal,
+        light,
+        atlas.texels,
+        atlas.starts,
+        atlas.sizes,
+        atlas.metres,
+        sky.panorama,
+        sky.sun,
+        sky.horizon.astype(np.float32),
+    )
+
+
+def _cast(scene: EmbreeScene, origins: Floats, directions: Floats) -> dict[str, NDArray[np.generic]]:
+    """Hits of all rays, a chunk at a time."""
+    parts = []
+    for start in range(0, len(directions), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        parts.append(scene.run(np.ascontiguousarray(origins[part]), directions[part], output=True))
+    return {key: np.concatenate([p[key] for p in parts]) for key in ("primID", "u", "v", "tfar")}
+
+
+def _lens_rays(model: CameraModel, du: float, dv: float) -> tuple[Floats, NDArray[np.int32], Floats]:
+    """Rays through pixel centres shifted by (du, dv): unit rays, pixel numbers, pixel widths in radians."""
+    width, height = model.width_px, model.height_px
+    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    pixels = np.stack([u.ravel() + du, v.ravel() + dv], 1)
+    rays, valid = model.unproject(pixels)
+    right, right_valid = model.unproject(pixels + [0.25, 0.0])
+    below, below_valid = model.unproject(pixels + [0.0, 0.25])
+    across = 4 * np.linalg.norm(right - rays, axis=1)
+    down = 4 * np.linalg.norm(below - rays, axis=1)
+    known = valid & right_valid & below_valid
+    typical = float(np.median(across[known])) if known.any() else 1e-3
+    size = np.where(known, np.sqrt(across * down), typical)
+    number = np.flatnonzero(valid).astype(np.int32)
+    return rays[valid].astype(np.float32), number, size[valid].astype(np.float32)
+
+
+def _per_row(view: View, world_from_rig: SE3) -> tuple[Array, Array]:
+    world_from_cam = world_from_rig * view.rig_from_cam
+    height = view.shape[0]
+    rotation = np.broadcast_to(world_from_cam.rotation, (height, 3, 3))
+    centre = np.broadcast_to(world_from_cam.translation, (height, 3))
+    return np.ascontiguousarray(rotation), np.ascontiguousarray(centre)
+
+
+def _empty_mirrored(count: int) -> Mirrored:
+    def plain() -> Floats:
+        return np.empty(count, np.float32)
+
+    def vectors() -> Floats:
+        return np.empty((count, 3), np.float32)
+
+    return Mirrored(vectors(), vectors(), np.empty(count, np.int32), plain(), plain(), plain(), plain())
+
+
+def _water(sea: WaveField, time_s: float) -> Water:
+    cells, starts, lost, at, highest = [], [], [], 0, 0.0
+    for tile in sea.tiles:
+        surface = tile.surface(time_s)
+        highest += float(np.abs(surface[..., 0]).max())
+        full = float(np.var(surface[..., 1]) + np.var(surface[..., 2])) / 2
+        row, row_lost = [], []
+        for level in range(_LEVELS):
+            cells.append(surface.reshape(-1, 3))
+            row.append(at)
+            at += len(cells[-1])
+            row_lost.append(max(full - float(np.var(surface[..., 1]) + np.var(surface[..., 2])) / 2, 0.0))
+            n = TILE_CELLS >> (level + 1)
+            surface = surface.reshape(n, 2, n, 2, 3).mean(axis=(1, 3))
+        starts.append(row)
+        lost.append(row_lost)
+    lengths = np.array([tile.length_m for tile in sea.tiles], np.float32)
+    return Water(
+        np.concatenate(cells).astype(np.float32),
+        np.array(starts),
+        lengths,
+        np.array(lost, np.float32),
+        max(highest, 1e-3),
+    )
