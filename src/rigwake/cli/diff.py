@@ -12,7 +12,7 @@ from rigwake.cli.console import next_step, out, write_json
 
 
 def command(
-    first: Annotated[Path, typer.Argument(help="A calibration.yaml.")],
+    first: Annotated[Path, typer.Argument(help="A calibration, of any format that export writes.")],
     second: Annotated[Path, typer.Argument(help="Another one of the same rig.")],
     range_m: Annotated[
         list[float] | None, typer.Option("--range", help="Ranges in metres at which pixels are compared.")
@@ -25,12 +25,13 @@ def command(
 
     Example: [cyan]rigwake diff june.yaml july.yaml --range 10 --range 100[/cyan]
     """
-    from rigwake.calibration import load_calibration
     from rigwake.calibration.yaml_file import plain
     from rigwake.evaluate.calibrations import compare_calibrations
+    from rigwake.exporters import in_common_frame, read_calibration
 
     ranges = range_m or [5.0, 20.0, 100.0]
-    differences = compare_calibrations(load_calibration(first), load_calibration(second), ranges)
+    a, b, notes = in_common_frame(read_calibration(first), read_calibration(second))
+    differences = compare_calibrations(a, b, ranges)
     if json_file is not None:
         content = {
             name: {
@@ -57,5 +58,7 @@ def command(
             name, f"{d.rotation_deg:.4f}", *(f"{x:+.1f}" for x in d.translation_mm), sigmas, *shifts
         )
     out.print(table)
+    for note in notes:
+        out.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     out.print("sigmas: root mean square difference in units of both covariances; about 1 means they agree.")
     next_step(f"rigwake export {second} --to ros-static-tf -o tf.launch.py", "load one into your system")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,7 @@ from rigwake.errors import UsageError
 
 
 def command(
-    calibration: Annotated[Path, typer.Argument(help="A calibration.yaml.")],
+    calibration: Annotated[Path, typer.Argument(help="A calibration, of any format that export writes.")],
     truth: Annotated[
         Path, typer.Option("--truth", help="The known rig: a truth.yaml or another calibration.yaml.")
     ],
@@ -31,14 +32,16 @@ def command(
 
     Example: [cyan]rigwake evaluate OUT/calibration.yaml --truth truth.yaml --json errors.json[/cyan]
     """
-    from rigwake.calibration import load_calibration
     from rigwake.evaluate.calibrations import evaluate_calibration
+    from rigwake.exporters import UNNAMED_FRAMES, read_calibration
     from rigwake.readers.truth import read_true_rig, rig_in_frame
 
     if gauge not in ("reference", "align"):
         raise UsageError(f"--gauge {gauge!r} is unknown.", remedy="Choose reference or align.")
-    found = load_calibration(calibration)
+    found = read_calibration(calibration)
     rig = read_true_rig(truth)
+    if found.reference in UNNAMED_FRAMES:
+        found = replace(found, reference=rig.reference)
     errors = evaluate_calibration(
         found,
         rig_in_frame(rig, found.reference) if gauge == "reference" else rig,

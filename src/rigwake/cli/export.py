@@ -1,0 +1,61 @@
+"""`rigwake export`: a calibration in the format of another program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rigwake.cli.console import next_step, out
+from rigwake.errors import UsageError
+
+
+def command(
+    calibration: Annotated[
+        Path, typer.Argument(help="A calibration.yaml, or a file of any format that export writes.")
+    ],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            help="kalibr, openvins, basalt, camodocal, colmap, mrcal, opencv, ros-static-tf, urdf, json or csv.",
+        ),
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File or folder to write; default beside the input.")
+    ] = None,
+    parent_frame: Annotated[str, typer.Option(help="ROS, URDF: the parent frame; default the rig's.")] = "",
+    child_frame: Annotated[
+        str, typer.Option(help="ROS, URDF: the cameras' frames.")
+    ] = "{name}_optical_frame",
+    imu: Annotated[
+        Path | None, typer.Option(help="Kalibr's imu.yaml, for formats that hold IMU noise (basalt).")
+    ] = None,
+    max_fit_error: Annotated[
+        float, typer.Option(help="Largest error, in pixels, of a lens that has to be converted.")
+    ] = 0.5,
+    allow_undetermined: Annotated[
+        bool, typer.Option(help="Leave cameras out that are not fully determined, instead of refusing.")
+    ] = False,
+) -> None:
+    """Write a calibration so that ROS, Kalibr, OpenVINS, Basalt, COLMAP, mrcal, OpenCV or CamOdoCal load it.
+
+    Example: [cyan]rigwake export OUT/calibration.yaml --to kalibr -o camchain.yaml[/cyan]
+    """
+    from rigwake.exporters import FORMATS, ExportOptions, export_calibration, read_calibration
+    from rigwake.exporters.basalt import read_imu_noise
+
+    if to not in FORMATS:
+        raise UsageError(f"There is no format {to!r}.", remedy=f"Known: {', '.join(FORMATS)}.")
+    target = output or calibration.parent / "exports" / FORMATS[to].usual_file
+    options = ExportOptions(
+        parent_frame, child_frame, None if imu is None else read_imu_noise(imu), max_fit_error
+    )
+    notes = export_calibration(
+        read_calibration(calibration), to, target, options, allow_undetermined=allow_undetermined
+    )
+    out.print(f"{target}: {FORMATS[to].what}", markup=False, highlight=False)
+    for note in notes:
+        out.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+    next_step(f"rigwake diff {calibration} {target}", "compare what was written with where it came from")
