@@ -15,6 +15,7 @@ LAYERS = [
     ["trajectory", "rig"],
     ["recording", "tracks", "calibration"],
     ["readers", "writers"],
+    ["inspection"],
     ["intrinsics"],
     ["tracking"],
     ["bundle"],  # least squares over states, landmarks and shared parameters: for one camera and for a rig

@@ -1,0 +1,119 @@
+"""`rigwake inspect REC`: what is in a recording, and is it enough to calibrate?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from rigwake.atomic import write_text_atomic
+from rigwake.cli.console import next_step, out, progress_bar, write_json
+from rigwake.cli.topic_options import TopicOption, TopicsOption
+from rigwake.inspection.clocks import ClockOffset
+from rigwake.inspection.inspect import Inspection, inspect_recording
+from rigwake.inspection.page import inspection_page
+from rigwake.inspection.summary import inspection_to_dict
+from rigwake.inspection.verdict import Verdict, judge
+from rigwake.readers.open import open_recording
+from rigwake.readers.topics import TopicMap
+
+_COLOURS = {"enough": "green", "partly": "yellow", "not enough": "red"}
+_SEVERITIES = {"note": "dim", "warning": "yellow", "error": "red"}
+_MARKS = {True: "[green]yes[/green]", False: "[red]no[/red]", None: "[yellow]cannot tell[/yellow]"}
+
+
+def command(
+    recording: Annotated[
+        Path, typer.Argument(help="ROS bag, MCAP, EuRoC or KITTI folder, folder of images, NMEA log.")
+    ],
+    topic: TopicOption = (),
+    topics: TopicsOption = None,
+    json: Annotated[
+        Path | None, typer.Option(help="Write everything measured as JSON ('-' prints it).")
+    ] = None,
+    html: Annotated[Path | None, typer.Option(help="Write one HTML page with plots.")] = None,
+) -> None:
+    """Sensors, rates, gaps, clocks and motion of a recording: is it enough to calibrate?"""
+    opened = open_recording(recording, TopicMap.from_options(topic, topics))
+    with progress_bar() as bar:
+        task = bar.add_task("reading", total=1)
+        inspection = inspect_recording(
+            opened, lambda text, done, total: bar.update(task, description=text, completed=done, total=total)
+        )
+    verdict = judge(inspection)
+    if json is not None:
+        write_json(json, inspection_to_dict(inspection, verdict))
+    if html is not None:
+        write_text_atomic(html, inspection_page(inspection, verdict))
+    if str(json) != "-":
+        _print(inspection, verdict)
+        if verdict.word == "not enough":
+            next_step("rigwake inspect NEW_RECORDING", "after recording again as advised")
+        else:
+            next_step(f"rigwake calibrate {recording} -o OUT", "estimate the rig")
+
+
+def _print(inspection: Inspection, verdict: Verdict) -> None:
+    recording = inspection.recording
+    out.print(f"[bold]{escape(recording.path.name)}[/bold]  {recording.kind}")
+    out.print(_sensor_table(inspection))
+    for key in inspection.timings:
+        if what := _what(inspection, key):
+            out.print(f"[dim]{escape(key)}: {escape(what)}[/dim]")
+    checks = Table("check", "measured", "enough", box=None, pad_edge=False)
+    for check in verdict.checks:
+        checks.add_row(check.name, escape(check.measured), _MARKS[check.passed])
+    out.print(checks)
+    for finding in inspection.findings:
+        colour = _SEVERITIES.get(finding.severity, "dim")
+        out.print(
+            f"[{colour}]{finding.severity}[/{colour}] {escape(finding.sensor)}: {escape(finding.message)}",
+            soft_wrap=True,
+        )
+    out.print(f"\n[bold {_COLOURS[verdict.word]}]{escape(verdict.summary)}[/]")
+    for line in verdict.advice:
+        out.print(f"  → {escape(line)}", soft_wrap=True)
+
+
+def _sensor_table(inspection: Inspection) -> Table:
+    heads = ("sensor", "samples", "s", "Hz", "jitter ms", "missing", "clock to IMU")
+    table = Table(*heads, box=None, pad_edge=False)
+    for column in table.columns:
+        column.no_wrap = True
+    for key, t in inspection.timings.items():
+        table.add_row(
+            escape(key),
+            str(t.samples),
+            f"{t.duration_s:.1f}",
+            f"{t.rate_hz:.2f}",
+            f"{t.jitter_ms:.2f}",
+            str(t.dropped),
+            _clock_words(inspection.clocks.get(key)),
+        )
+    return table
+
+
+def _clock_words(clock: ClockOffset | None) -> str:
+    if clock is None:
+        return ""
+    if clock.offset_s is None or clock.std_s is None:
+        return "[dim]cannot tell[/dim]"
+    return f"{1e3 * clock.offset_s:+.0f} ± {1e3 * clock.std_s:.0f} ms"
+
+
+def _what(inspection: Inspection, key: str) -> str:
+    kind, _, name = key.partition(".")
+    recording = inspection.recording
+    if kind == "camera":
+        camera = recording.cameras[name]
+        lens = camera.model.model if camera.model is not None else "no intrinsics"
+        return f"{camera.width_px} x {camera.height_px}, {lens}"
+    if kind == "imu" and inspection.turning is not None:
+        major, minor = inspection.turning.tilt_std_deg
+        return f"turns {inspection.turning.turned_deg:.0f} deg, tilts {major:.1f}, {minor:.1f} deg"
+    if kind == "gnss" and inspection.travel is not None:
+        return f"{inspection.travel.path_m:.0f} m, up to {inspection.travel.max_speed:.1f} m/s"
+    return ""

@@ -1,0 +1,1 @@
+"""What is in a recording, and whether it is enough to calibrate."""

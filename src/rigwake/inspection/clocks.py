@@ -1,0 +1,176 @@
+"""Offsets between the clocks of sensors, from motion that both of them feel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigwake.geometry.so3 import Array, nearest_rotation
+from rigwake.inspection.motion import levelled_rotations
+from rigwake.inspection.pictures import Pictures
+from rigwake.recording import GnssStream, ImuStream, Stamps
+
+SEARCH_S = 1.0
+_MIN_EXPLAINED = 0.5  # of the variance; below, the lag is chance
+_MIN_PAIRS = 20
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """`t_imu = t_sensor + offset_s`, its standard deviation, and the share of the motion that agrees there.
+
+    offset_s and std_s are None where the motion does not tell; `why` says so.
+    """
+
+    sensor: str
+    offset_s: float | None
+    std_s: float | None
+    explained: float
+    why: str = ""
+
+
+def _refined(lags: Array, cost: Array, samples: int, sensor: str, total: float) -> ClockOffset:
+    """The minimum of a least-squares cost over lags, by a parabola; its standard deviation by the curvature."""
+    best = int(np.argmin(cost))
+    explained = 1 - float(cost[best]) / max(total, 1e-30)
+    if explained < _MIN_EXPLAINED:
+        return ClockOffset(sensor, None, None, explained, "its motion does not match the IMU's at any offset")
+    if best in (0, len(lags) - 1):
+        return ClockOffset(sensor, None, None, explained, f"the offset is beyond {abs(lags[best]):.1f} s")
+    step = float(lags[1] - lags[0])
+    below, centre, above = (float(c) for c in cost[best - 1 : best + 2])
+    curvature = below - 2 * centre + above
+    shift = 0.5 * (below - above) / curvature if curvature > 0 else 0.0
+    variance = centre / max(samples - 4, 1)
+    std = step * float(np.sqrt(2 * variance / curvature)) if curvature > 0 else step
+    return ClockOffset(sensor, float(lags[best]) + shift * step, std, explained)
+
+
+def _mean_rates(imu: ImuStream) -> Callable[[Array, Array], Array]:
+    """Mean angular rate between two times (seconds since the IMU's first sample), from the gyro's integral."""
+    times = (imu.timestamps_ns - imu.timestamps_ns[0]) * 1e-9
+    steps = np.diff(times)[:, None] * (imu.gyro[1:] + imu.gyro[:-1]) / 2
+    angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+
+    def rates(start: Array, end: Array) -> Array:
+        gained = [np.interp(end, times, angle[:, k]) - np.interp(start, times, angle[:, k]) for k in range(3)]
+        return np.column_stack(gained) / (end - start)[:, None]
+
+    return rates
+
+
+def camera_offset(camera: str, pictures: Pictures, imu: ImuStream) -> ClockOffset:
+    """Offset of a camera's clock: at each lag the rotation and bias that best turn gyro rates into image
+    rates are solved (Wahba), and the lag of the smallest residual wins."""
+    start, end = (_since(stamps, imu) for stamps in (pictures.start_ns, pictures.end_ns))
+    length = (imu.timestamps_ns[-1] - imu.timestamps_ns[0]) * 1e-9
+    inside = (start > SEARCH_S) & (end < length - SEARCH_S)
+    if inside.sum() < _MIN_PAIRS:
+        return ClockOffset(camera, None, None, 0.0, "too few frames could be compared with the IMU")
+    start, end = start[inside], end[inside]
+    measured = pictures.rotations[inside] / (end - start)[:, None]
+    measured = measured - np.median(measured, axis=0)
+    rates = _mean_rates(imu)
+    lags = np.arange(-SEARCH_S, SEARCH_S + 1e-9, 0.01)
+    weights = np.ones(len(measured))
+    for _ in range(3):
+        fits = [_rotation_residuals(measured, rates(start + lag, end + lag), weights) for lag in lags]
+        cost = np.array([np.sum(weights * np.sum(r**2, axis=1)) for r in fits])
+        best = np.linalg.norm(fits[int(np.argmin(cost))], axis=1)
+        weights = 1 / (1 + (best / (2 * np.median(best) + 1e-12)) ** 2) ** 2
+    total = float(np.sum(weights * np.sum(measured**2, axis=1)))
+    return _refined(lags, cost, 3 * int(inside.sum()), camera, total)
+
+
+def _rotation_residuals(measured: Array, gyro: Array, weights: Array) -> Array:
+    a = measured - np.average(measured, axis=0, weights=weights)
+    b = gyro - np.average(gyro, axis=0, weights=weights)
+    R = nearest_rotation((weights[:, None] * a).T @ b)
+    return np.asarray(a - b @ R.T)
+
+
+def _since(stamps: Stamps, imu: ImuStream) -> Array:
+    return np.asarray((stamps - imu.timestamps_ns[0]) * 1e-9)
+
+
+def gnss_offset(gnss: GnssStream, imu: ImuStream) -> ClockOffset:
+    """Offset of a receiver's clock: second differences of its positions over a second, against the
+    accelerometer's twice integrated over the same.
+
+    `D (c, s) = A + (second difference of R) r + B b`: D the positions' differences, turned by the unknown start
+    of the heading (c, s); A the levelled accelerations under a triangular kernel; r the lever arm of the
+    antenna; b the accelerometer's bias. At each lag the linear unknowns are solved, and the smallest residual
+    wins. Sections are solved by themselves, as the heading drifts.
+    """
+    times = (gnss.timestamps_ns - imu.timestamps_ns[0]) * 1e-9
+    imu_times = (imu.timestamps_ns - imu.timestamps_ns[0]) * 1e-9
+    first = max(times[0], imu_times[0] + SEARCH_S) + 2 * _SPAN_S
+    last = min(times[-1], imu_times[-1] - SEARCH_S) - 2 * _SPAN_S
+    if last - first < 10.0:
+        return ClockOffset(gnss.name, None, None, 0.0, "too short, or not at the time of the IMU")
+    step = max(float(np.median(np.diff(times))), 0.1)
+    lags = np.arange(-SEARCH_S, SEARCH_S + 1e-9, 0.02)
+    inertial = _InertialPath.of(imu)
+    cost, total, samples = np.zeros(len(lags)), 0.0, 0
+    sections = min(max(int((last - first) / _SECTION_S), 1), _MAX_SECTIONS)
+    for start in np.linspace(first, max(last - _SECTION_S, first), sections):
+        at = np.arange(start, min(start + _SECTION_S, last), step)
+        moved = _second_difference(lambda t: _interpolated(t, times, gnss.position_enu), at)
+        residuals = [_inertial_residual(moved, inertial, at + lag) for lag in lags]
+        cost += [r for r, _ in residuals]
+        total += residuals[int(np.argmin([r for r, _ in residuals]))][1]
+        samples += moved.size
+    # neighbouring second differences share most of their noise
+    return _refined(lags, cost, max(round(samples * step / (2 * _SPAN_S)), 5), gnss.name, total)
+
+
+_SPAN_S = 1.0
+_SECTION_S = 40.0
+_MAX_SECTIONS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class _InertialPath:
+    """Twice-integrated columns (N, 3, k) of what moves the antenna, at times (N,): acceleration, bias; and the
+    rotations themselves for the lever arm."""
+
+    times: Array
+    integrals: Array
+    rotations: Array
+
+    @classmethod
+    def of(cls, imu: ImuStream) -> _InertialPath:
+        times = np.asarray((imu.timestamps_ns - imu.timestamps_ns[0]) * 1e-9)
+        R = levelled_rotations(imu)
+        force = np.einsum("nij,nj->ni", R, imu.accel)
+        force = force - force.mean(axis=0)
+        columns = np.concatenate([force[:, :, None], R], axis=2)
+        steps = np.diff(times, prepend=times[0])[:, None, None]
+        speeds = np.cumsum(columns * steps, axis=0)
+        return cls(times, np.cumsum(speeds * steps, axis=0), R)
+
+
+def _interpolated(at: Array, times: Array, values: Array) -> Array:
+    flat = values.reshape(len(values), -1)
+    columns = [np.interp(at, times, flat[:, k]) for k in range(flat.shape[1])]
+    return np.stack(columns, axis=1).reshape(len(at), *values.shape[1:])
+
+
+def _second_difference(values_at: Callable[[Array], Array], at: Array) -> Array:
+    return np.asarray(values_at(at + _SPAN_S) - 2 * values_at(at) + values_at(at - _SPAN_S))
+
+
+def _inertial_residual(moved: Array, inertial: _InertialPath, at: Array) -> tuple[float, float]:
+    """Sum of squared residuals of the linear fit at these times, and of the accelerations alone."""
+    integrals = _second_difference(lambda t: _interpolated(t, inertial.times, inertial.integrals), at)
+    lever = _second_difference(lambda t: _interpolated(t, inertial.times, inertial.rotations), at)
+    accelerations, bias = integrals[:, :, 0], integrals[:, :, 1:]
+    zero = np.zeros(len(at))
+    cosine = np.stack([moved[:, 0], moved[:, 1], zero], axis=1)
+    sine = np.stack([-moved[:, 1], moved[:, 0], zero], axis=1)
+    rows = np.concatenate([cosine[:, :, None], sine[:, :, None], -lever, -bias], axis=2).reshape(-1, 8)
+    target = (accelerations - np.stack([zero, zero, moved[:, 2]], axis=1)).ravel()
+    solution = np.linalg.lstsq(rows, target, rcond=1e-6)[0]
+    return float(np.sum((target - rows @ solution) ** 2)), float(np.sum(target**2))
