@@ -16,8 +16,9 @@ from rigwake.geometry.so3 import Array
 from rigwake.recording import CameraStream, Image
 from rigwake.tracking.descriptor_front_end import DescriptorFrontEnd
 from rigwake.tracking.klt_front_end import KltFrontEnd, Observed
-from rigwake.tracking.masks import CameraMask, HorizonMask, beyond_lens
+from rigwake.tracking.masks import CameraMask, beyond_lens
 from rigwake.tracking.options import TrackingOptions
+from rigwake.tracking.water import HorizonMask
 from rigwake.tracks import TrackingReport, Tracks
 
 _MIN_CONTRAST = 2.0  # grey levels: an image with less standard deviation shows nothing

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 
+from rigwake.atomic import atomic_path
 from rigwake.cameras.base import CameraModel, Mask
+from rigwake.errors import InputError, UsageError
 from rigwake.geometry.so3 import Array
 
 
@@ -30,6 +34,40 @@ class CameraMask:
             usable &= ~region
         return usable
 
+    def with_region(self, source: str, region: Mask) -> CameraMask:
+        """The same mask, with `region` (H, W) excluded as `source`."""
+        if region.shape != (self.height_px, self.width_px):
+            raise UsageError(
+                f"The {source} mask is {region.shape[1]}x{region.shape[0]} pixels, "
+                f"the images are {self.width_px}x{self.height_px}.",
+                remedy="Give a mask of the size of the images.",
+            )
+        return replace(self, excluded={**self.excluded, source: np.asarray(region, dtype=bool)})
+
+    def save(self, folder: Path, camera: str) -> list[Path]:
+        """Write `mask_<camera>.png` (white: usable) and one `mask_<camera>_<source>.png` each (white: excluded)."""
+        images = {f"mask_{camera}": self.usable}
+        images |= {f"mask_{camera}_{source}": region for source, region in self.excluded.items()}
+        written = []
+        for stem, region in images.items():
+            path = folder / f"{stem}.png"
+            with atomic_path(path) as temporary:
+                if not cv2.imwrite(str(temporary), region.astype(np.uint8) * 255):
+                    raise InputError(f"{path} cannot be written.")
+            written.append(path)
+        return written
+
+
+def mask_from_file(path: Path, width_px: int, height_px: int) -> CameraMask:
+    """A mask drawn by hand: black pixels are excluded. Raises InputError, UsageError if the size is another."""
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    if image is None:
+        raise InputError(
+            f"{path} is not an image.",
+            remedy="A mask is a PNG of the size of the images, black where excluded.",
+        )
+    return CameraMask(width_px, height_px).with_region("file", image < 128)
+
 
 def pixel_grid(width_px: int, height_px: int) -> Array:
     """Centres of all pixels, row by row: (H * W, 2)."""
@@ -42,30 +80,6 @@ def beyond_lens(model: CameraModel, margin: float = np.deg2rad(1.0)) -> Mask:
     bearings, valid = model.unproject(pixel_grid(model.width_px, model.height_px))
     valid &= np.nan_to_num(bearings[:, 2], nan=-1.0) > np.cos(min(model.max_angle - margin, np.pi))
     return np.asarray(~valid.reshape(model.height_px, model.width_px))
-
-
-class HorizonMask:
-    """What lies below the horizon, frame by frame.
-
-    On open water that is the water, which moves: corners on it are not static points.
-    """
-
-    def __init__(self, model: CameraModel, margin: float = np.deg2rad(0.5)) -> None:
-        """margin: radians above the horizon that are left out with it, for errors of the attitude."""
-        self._shape = (model.height_px, model.width_px)
-        rows, columns = -(-model.height_px // 2), -(-model.width_px // 2)
-        bearings, _ = model.unproject(2 * pixel_grid(columns, rows) + 0.5)
-        planes = np.nan_to_num(bearings, nan=0.0).astype(np.float32).T
-        self._x, self._y, self._z = (np.ascontiguousarray(p).reshape(rows, columns) for p in planes)
-        self._sine = np.float32(np.sin(margin))
-
-    def below(self, up_cam: Array) -> Mask:
-        """(H, W), True below the horizon (in steps of 2 px); `up_cam` (3,) is the unit vector against gravity in
-        camera axes."""
-        x, y, z = up_cam.astype(np.float32)
-        below = x * self._x + y * self._y + z * self._z < self._sine
-        height, width = self._shape
-        return np.asarray(np.repeat(np.repeat(below, 2, axis=0), 2, axis=1)[:height, :width])
 
 
 def inside(usable: Mask, pixels: Array) -> Mask:

@@ -39,29 +39,30 @@ _CONVERGED_PX = 0.005
 class PatchShape:
     """Where a patch is sampled: offsets (K, 2) in pixels and the root of each sample's weight (K,).
 
-    right, below: (K,) index of the neighbouring sample, -1 where there is none.
+    lower_right, lower_left: (K,) index of the neighbouring sample, -1 where there is none.
     """
 
     offsets: Floats
     root_weights: Floats
-    right: NDArray[np.int64]
-    below: NDArray[np.int64]
+    lower_right: NDArray[np.int64]
+    lower_left: NDArray[np.int64]
 
     @classmethod
     def disc(cls, radius_px: int) -> PatchShape:
-        """All pixels within `radius_px`, weighted down towards the rim by a Gaussian of that width."""
+        """Every other pixel (like the black squares of a chessboard) within `radius_px`, weighted down towards
+        the rim by a Gaussian of that width. A lens blurs more than that spacing; all pixels tell no more."""
         reach = np.arange(-radius_px, radius_px + 1)
         y, x = (grid.ravel() for grid in np.meshgrid(reach, reach, indexing="ij"))
         distance = np.hypot(x, y)
-        kept = distance <= radius_px + 0.5
+        kept = (distance <= radius_px + 0.5) & ((x + y) % 2 == 0)
         x, y, distance = x[kept], y[kept], distance[kept]
         weight = np.exp(-0.5 * (distance / radius_px) ** 2)
         index = {(int(i), int(j)): k for k, (i, j) in enumerate(zip(x, y, strict=True))}
         return cls(
             np.stack([x, y], axis=1).astype(np.float32),
             np.sqrt(weight / weight.mean()).astype(np.float32),
-            np.array([index.get((int(i) + 1, int(j)), -1) for i, j in zip(x, y, strict=True)]),
-            np.array([index.get((int(i), int(j) + 1), -1) for i, j in zip(x, y, strict=True)]),
+            np.array([index.get((int(i) + 1, int(j) + 1), -1) for i, j in zip(x, y, strict=True)]),
+            np.array([index.get((int(i) - 1, int(j) + 1), -1) for i, j in zip(x, y, strict=True)]),
         )
 
 
@@ -147,8 +148,8 @@ def register(
         references.contrast,
         shape.offsets,
         shape.root_weights,
-        shape.right,
-        shape.below,
+        shape.lower_right,
+        shape.lower_left,
         pixels,
         warps,
         1.0 / warp_prior_std**2,
@@ -162,7 +163,7 @@ def register(
 def _noise_bandwidth(lag_sums: Array) -> float:
     """How much more a smooth pattern suffers from the residuals than if neighbours were independent.
 
-    lag_sums: (N, 3) sums of squared residuals and of products with the right and lower neighbours. For a
+    lag_sums: (N, 3) sums of squared residuals and of products with two neighbours. For a
     separable first-order process with neighbour correlation r per axis the factor is (1 + r) / (1 - r) each.
     """
     power, across, down = lag_sums.sum(axis=0)
@@ -233,8 +234,8 @@ def _register(
     contrast: Array,
     offsets: Floats,
     root_weights: Floats,
-    right: NDArray[np.int64],
-    below: NDArray[np.int64],
+    lower_right: NDArray[np.int64],
+    lower_left: NDArray[np.int64],
     pixels: Array,
     warps: Array,
     warp_precision: float,
@@ -263,7 +264,7 @@ def _register(
             correlation[n] = sums[_COLUMNS - 1] / sqrt(sums[_COLUMNS - 1] ** 2 + power)
             if found[n]:  # converged in the step before: these are the final residuals
                 spread[n] = _position_spread(matrix)
-                _neighbour_products(values, pattern[n], sums, right, below, lag_sums[n])
+                _neighbour_products(values, pattern[n], sums, lower_right, lower_left, lag_sums[n])
                 break
             strayed = prediction_from_patch @ warps[n]
             _normal_equations(gain, information[n], sums, warp_precision * variance[n], strayed, matrix, step)
@@ -391,8 +392,8 @@ def _neighbour_products(
     values: Floats,
     pattern: Floats,
     sums: Floats,
-    right: NDArray[np.int64],
-    below: NDArray[np.int64],
+    lower_right: NDArray[np.int64],
+    lower_left: NDArray[np.int64],
     lag_sums: Array,
 ) -> None:
     """Turn `values` into residuals; their squares and products with neighbours are summed up."""
@@ -401,7 +402,7 @@ def _neighbour_products(
             values[k] -= sums[i] * pattern[k, i]
     for k in range(len(values)):
         lag_sums[0] += values[k] * values[k]
-        if right[k] >= 0:
-            lag_sums[1] += values[k] * values[right[k]]
-        if below[k] >= 0:
-            lag_sums[2] += values[k] * values[below[k]]
+        if lower_right[k] >= 0:
+            lag_sums[1] += values[k] * values[lower_right[k]]
+        if lower_left[k] >= 0:
+            lag_sums[2] += values[k] * values[lower_left[k]]

@@ -1,0 +1,63 @@
+"""Water and sky: what moves by itself or has nothing to hold on to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rigwake.cameras.base import CameraModel, Mask
+from rigwake.geometry.so3 import Array
+from rigwake.recording import Image
+from rigwake.tracking.masks import pixel_grid
+
+_SMOOTH = 6  # grey levels between neighbours, after a little blur
+_NEAR_TOP = 0.05  # of the sine of the elevation
+
+
+class HorizonMask:
+    """What lies below the horizon, frame by frame.
+
+    On open water that is the water, which moves: corners on it are not static points.
+    """
+
+    def __init__(self, model: CameraModel, margin: float = np.deg2rad(0.5)) -> None:
+        """margin: radians above the horizon that are left out with it, for errors of the attitude."""
+        self._shape = (model.height_px, model.width_px)
+        rows, columns = -(-model.height_px // 2), -(-model.width_px // 2)
+        bearings, _ = model.unproject(2 * pixel_grid(columns, rows) + 0.5)
+        planes = np.nan_to_num(bearings, nan=0.0).astype(np.float32).T
+        self._x, self._y, self._z = (np.ascontiguousarray(p).reshape(rows, columns) for p in planes)
+        self._sine = np.float32(np.sin(margin))
+
+    def below(self, up_cam: Array) -> Mask:
+        """(H, W), True below the horizon (in steps of 2 px); `up_cam` (3,) is the unit vector against gravity in
+        camera axes."""
+        return self._full_size(self._height(up_cam) < self._sine)
+
+    def _height(self, up_cam: Array) -> NDArray[np.float32]:
+        """Sine of the elevation of every second pixel."""
+        x, y, z = up_cam.astype(np.float32)
+        return np.asarray(x * self._x + y * self._y + z * self._z)
+
+    def _full_size(self, half: NDArray[Any]) -> NDArray[Any]:
+        height, width = self._shape
+        return np.repeat(np.repeat(half, 2, axis=0), 2, axis=1)[:height, :width]
+
+    def sky(self, image: Image, up_cam: Array) -> Mask:
+        """(H, W), True where smooth image above the horizon reaches up to the zenith or the image's edge.
+
+        image: (H, W) grey. Clouds are smooth enough; what stands before the sky and all it encloses is kept.
+        """
+        soft = cv2.GaussianBlur(image, (0, 0), 1.5)
+        slope = cv2.morphologyEx(soft, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
+        smooth = (slope <= _SMOOTH) & ~self.below(up_cam)
+        _, labels = cv2.connectedComponents(smooth.astype(np.uint8), connectivity=4)
+        top = np.where(smooth, self._full_size(self._height(up_cam)), -1.0)
+        highest = np.full(int(labels.max()) + 1, -1.0)
+        np.maximum.at(highest, labels.ravel(), top.ravel())
+        reaches_top = highest >= top.max() - _NEAR_TOP
+        reaches_top[0] = False
+        return np.asarray(reaches_top[labels])
