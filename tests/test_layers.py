@@ -19,8 +19,8 @@ LAYERS = [
     ["intrinsics"],
     ["tracking"],
     ["bundle"],  # least squares over states, landmarks and shared parameters: for one camera and for a rig
-    ["odometry"],
     ["sync"],
+    ["odometry"],
     ["handeye"],
     ["adjustment"],  # the rig problem: initial values, cross-camera landmarks, outlier rounds
     ["simulate"],
