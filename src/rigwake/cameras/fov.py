@@ -22,7 +22,7 @@ def _project_point(
     t = tan(0.5 * w)
     q = x * x + y * y
     rho = sqrt(q)
-    if q < 1e-30 * (q + z * z):
+    if z > 0.0 and q < 1e-30 * z * z:
         s = 2.0 * t / (w * z)
         scale_to_pixel(x, y, s, 0.0, -s / z, p, pixel, d_point, d_params)
         d_params[0, 4] = d_params[1, 4] = 0.0

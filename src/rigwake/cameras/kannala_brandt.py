@@ -31,7 +31,7 @@ def _project_point(
 ) -> None:
     q = x * x + y * y
     n2 = q + z * z
-    if q < 1e-30 * n2:
+    if z > 0.0 and q < 1e-30 * n2:
         scale_to_pixel(x, y, 1.0 / z, 0.0, -1.0 / (z * z), p, pixel, d_point, d_params)
         d_params[:, 4:] = 0.0
         return

@@ -74,7 +74,7 @@ def _project_point(
     x: float, y: float, z: float, p: Array, scratch: Array, pixel: Array, d_point: Array, d_params: Array
 ) -> None:
     # on the axis phi, and with it the asymmetric terms' derivative, is undefined: take phi = 0 beside it
-    if x * x + y * y < 1e-30 * z * z:
+    if z > 0.0 and x * x + y * y < 1e-30 * z * z:
         x, y = 1e-15 * z, 0.0
     q = x * x + y * y
     rho, n2 = sqrt(q), q + z * z

@@ -47,7 +47,7 @@ def _project_point(
     end = len(p) - 2
     q = x * x + y * y
     rho = sqrt(q)
-    if q < 1e-30 * z * z:
+    if z > 0.0 and q < 1e-30 * z * z:
         radius, s, s_q, s_z, pull = 0.0, -p[5] / z, 0.0, p[5] / (z * z), -1.0 / z
     else:
         radius = _radius_at(rho, z, p, scratch)

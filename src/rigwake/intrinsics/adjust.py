@@ -72,7 +72,7 @@ class NormalEquations:
     def step(self, damping: float) -> tuple[Array, Array]:
         """Steps of the camera's free parameters (P,) and of the poses (V, 6)."""
         S, g, solved = self.reduced(damping)
-        camera: Array = -np.linalg.solve(S, g)
+        camera = np.asarray(-np.linalg.solve(S, g), dtype=np.float64)
         return camera, -solved[..., -1] - np.einsum("vip,p->vi", solved[..., :-1], camera)
 
 
