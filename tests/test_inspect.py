@@ -40,7 +40,7 @@ def true_rotations(times: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def true_positions(times: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.column_stack([8 * np.sin(0.4 * times), 6 * np.cos(0.55 * times), 0.1 * np.sin(1.7 * times)])
+    return np.column_stack([4 * np.sin(0.4 * times), 3 * np.cos(0.55 * times), 0.1 * np.sin(1.7 * times)])
 
 
 def simulated_imu(seconds: float = 60.0, noise: float = 1e-3) -> ImuStream:
@@ -70,7 +70,7 @@ def test_levelled_rotations_keep_the_vertical_and_turn_as_the_boat_does() -> Non
     tilt = np.degrees(np.arccos(np.clip(np.einsum("ni,ni->n", R[:, 2], truth[:, 2]), -1, 1)))
     assert tilt.max() < 6.0  # accelerations of the boat pull the filter
     turn = turning(imu)
-    assert turn.turned_deg == pytest.approx(60 / (np.pi / 0.5) * 2 * np.degrees(1.2), rel=0.1)
+    assert turn.turned_deg == pytest.approx(60 / (2 * np.pi / 0.25) * 4 * np.degrees(1.2), rel=0.1)
     assert 2.5 < turn.tilt_std_deg[0] < 5.0
     assert 1.5 < turn.tilt_std_deg[1] < 3.5
 

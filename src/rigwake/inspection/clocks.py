@@ -96,13 +96,14 @@ def _since(stamps: Stamps, imu: ImuStream) -> Array:
 
 
 def gnss_offset(gnss: GnssStream, imu: ImuStream) -> ClockOffset:
-    """Offset of a receiver's clock: second differences of its positions over a second, against the
+    """Offset of a receiver's clock: second differences of its positions over half a second, against the
     accelerometer's twice integrated over the same.
 
-    `D (c, s) = A + (second difference of R) r + B b`: D the positions' differences, turned by the unknown start
-    of the heading (c, s); A the levelled accelerations under a triangular kernel; r the lever arm of the
-    antenna; b the accelerometer's bias. At each lag the linear unknowns are solved, and the smallest residual
-    wins. Sections are solved by themselves, as the heading drifts.
+    `D (c, s) = A + (second difference of R) r + B b + slow tilt`: D the positions' differences, turned by the
+    unknown start of the heading (c, s); A the levelled accelerations under a triangular kernel; r the lever arm
+    of the antenna; b the accelerometer's bias; and what gravity feigns through a slow error of the tilt. At
+    each lag these linear unknowns are solved, and the smallest residual wins. Sections are solved by themselves,
+    as the heading drifts.
     """
     times = (gnss.timestamps_ns - imu.timestamps_ns[0]) * 1e-9
     imu_times = (imu.timestamps_ns - imu.timestamps_ns[0]) * 1e-9
@@ -126,7 +127,7 @@ def gnss_offset(gnss: GnssStream, imu: ImuStream) -> ClockOffset:
     return _refined(lags, cost, max(round(samples * step / (2 * _SPAN_S)), 5), gnss.name, total)
 
 
-_SPAN_S = 1.0
+_SPAN_S = 0.5
 _SECTION_S = 40.0
 _MAX_SECTIONS = 4
 
@@ -170,7 +171,17 @@ def _inertial_residual(moved: Array, inertial: _InertialPath, at: Array) -> tupl
     zero = np.zeros(len(at))
     cosine = np.stack([moved[:, 0], moved[:, 1], zero], axis=1)
     sine = np.stack([-moved[:, 1], moved[:, 0], zero], axis=1)
-    rows = np.concatenate([cosine[:, :, None], sine[:, :, None], -lever, -bias], axis=2).reshape(-1, 8)
+    columns = [cosine[:, :, None], sine[:, :, None], -lever, -bias, _slow_tilt(at)]
+    rows = np.concatenate(columns, axis=2).reshape(3 * len(at), -1)
     target = (accelerations - np.stack([zero, zero, moved[:, 2]], axis=1)).ravel()
     solution = np.linalg.lstsq(rows, target, rcond=1e-6)[0]
     return float(np.sum((target - rows @ solution) ** 2)), float(np.sum(target**2))
+
+
+def _slow_tilt(at: Array) -> Array:
+    """(N, 3, 6) horizontal accelerations that a tilt error lets gravity feign: constant, linear, quadratic."""
+    t = (at - at.mean()) / max(float(np.ptp(at)), 1e-9)
+    columns = np.zeros((len(at), 3, 6))
+    for power in range(3):
+        columns[:, 0, 2 * power] = columns[:, 1, 2 * power + 1] = t**power
+    return columns

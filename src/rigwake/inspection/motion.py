@@ -10,8 +10,9 @@ import numpy as np
 from rigwake.geometry.so3 import Array
 from rigwake.recording import GnssStream, ImuStream, Stamps
 
-_SETTLING_S = 10.0  # time constant with which the filter trusts the accelerometer
+_SETTLING_S = 30.0  # time constant with which the filter trusts the accelerometer
 _STILL_GYRO = np.radians(0.5)
+_STILLEST_RATE = np.radians(1.0)
 _STILL_SPEED = 0.15  # m/s
 _SPEED_WINDOW_S = 1.0
 
@@ -92,7 +93,7 @@ def levelled_rotations(imu: ImuStream) -> Array:
     sideways = np.cross(first, np.eye(3)[np.argmin(np.abs(first))])
     sideways /= np.linalg.norm(sideways)
     start = np.stack([sideways, np.cross(first, sideways), first])
-    gyro = np.ascontiguousarray(imu.gyro - _still_rate(imu.gyro))
+    gyro = np.ascontiguousarray(imu.gyro - _gyro_bias(imu))
     return np.asarray(_levelled(gyro, up, _steps_s(imu), _SETTLING_S, start))
 
 
@@ -102,13 +103,9 @@ def _steps_s(imu: ImuStream) -> Array:
 
 
 def turning(imu: ImuStream) -> Turning:
-    """Turning and tilting from gyro and accelerometer.
-
-    The gyro bias is taken as the median rate of the stillest tenth of the recording, but only where that part
-    is slower than 1 deg/s; else as zero.
-    """
+    """Turning and tilting from gyro and accelerometer."""
     steps_s = _steps_s(imu)
-    gyro = imu.gyro - _still_rate(imu.gyro)
+    gyro = imu.gyro - _gyro_bias(imu)
     up = levelled_rotations(imu)[:, 2]
     yaw_rate = np.einsum("ni,ni->n", gyro, up)
     spread = np.linalg.eigvalsh(np.cov(up.T)) if len(up) > 1 else np.zeros(3)
@@ -128,11 +125,16 @@ def turning(imu: ImuStream) -> Turning:
     )
 
 
-def _still_rate(gyro: Array) -> Array:
-    speed = np.linalg.norm(gyro, axis=1)
-    still = gyro[speed <= np.quantile(speed, 0.1)]
-    rate = np.median(still, axis=0)
-    return rate if np.linalg.norm(rate) < np.radians(1.0) else np.zeros(3)
+def _gyro_bias(imu: ImuStream) -> Array:
+    """About the horizontal axes the mean rate, as a boat rolls and pitches to and fro; about the vertical the
+    median of the stillest tenth, where that is slower than 1 deg/s, else zero."""
+    up = imu.accel.mean(axis=0)
+    up = up / (np.linalg.norm(up) + 1e-12)
+    mean = imu.gyro.mean(axis=0)
+    horizontal = mean - up * (mean @ up)
+    speed = np.linalg.norm(imu.gyro - horizontal, axis=1)
+    still = float(np.median(imu.gyro[speed <= np.quantile(speed, 0.1)] @ up))
+    return np.asarray(horizontal + (still if abs(still) < _STILLEST_RATE else 0.0) * up)
 
 
 def _smoothed(values: Array, steps_s: Array) -> Array:
