@@ -19,7 +19,7 @@ from rigwake.handeye.observability import covariance, open_directions
 from rigwake.handeye.problem import HandeyeProblem, pose_problem
 from rigwake.handeye.seed import seed_handeye
 from rigwake.handeye.values import HandeyeOptions, HandeyeResult
-from rigwake.sync import estimate_time_offset
+from rigwake.sync import MIN_OVERLAP, estimate_time_offset
 from rigwake.trajectory import Trajectory
 
 
@@ -35,11 +35,9 @@ def calibrate_handeye(
     or its clock cannot be aligned), EstimationError (no convergence).
     """
     options = options or HandeyeOptions()
-    problem = pose_problem(reference, members, options)
-    offsets = [
-        estimate_time_offset(reference, member).offset_s if options.time_offset else 0.0 for member in members
-    ]
-    start = initial_mountings(problem, offsets)
+    offsets = [_clock(reference, member) if options.time_offset else None for member in members]
+    problem = pose_problem(reference, members, options, [offset is not None for offset in offsets])
+    start = initial_mountings(problem, [offset or 0.0 for offset in offsets])
     if options.method == "seed":
         return _seed_result(problem, start)
     estimate = maximise(problem, start, options)
@@ -50,6 +48,19 @@ def calibrate_handeye(
             remedy="Look at the trajectories: do they show one rigid body? Try --noise poses or increments.",
         )
     return _result(problem, estimate, options)
+
+
+def _clock(reference: Trajectory, member: Trajectory) -> float | None:
+    """A first offset of the member's clock; None if it cannot be told but both clocks seem to be one."""
+    try:
+        return estimate_time_offset(reference, member).offset_s
+    except UnobservableError:
+        shared = min(reference.timestamps_ns[-1], member.timestamps_ns[-1]) - max(
+            reference.timestamps_ns[0], member.timestamps_ns[0]
+        )
+        if shared * 1e-9 < MIN_OVERLAP * min(reference.duration_s, member.duration_s):
+            raise
+        return None
 
 
 def _result(problem: HandeyeProblem, estimate: Estimate, options: HandeyeOptions) -> HandeyeResult:
@@ -124,11 +135,12 @@ def _seed_result(problem: HandeyeProblem, start: Sequence[Mounting]) -> HandeyeR
     reference, sampled = problem.sampled(start)
     raw, members = {}, {}
     unknown = np.full((6, 6), np.nan)
-    for curve, member, mounting in zip(problem.members, sampled, start, strict=True):
+    parts = zip(problem.members, problem.layouts, sampled, start, strict=True)
+    for curve, layout, member, mounting in parts:
         name = curve.trajectory.name
         both = (reference.segments >= 0) & (member.segments >= 0)
         raw[name] = seed_handeye(reference.world_from_body[both], member.world_from_body[both])
-        offset = mounting.time_offset_s if problem.layouts[0].has_clock else None
+        offset = mounting.time_offset_s if layout.has_clock else None
         members[name] = CalibratedCamera(name, raw[name], unknown, time_offset_s=offset)
     return HandeyeResult(
         problem.reference.trajectory.name,

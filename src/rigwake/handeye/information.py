@@ -17,6 +17,7 @@ from rigwake.handeye.problem import HandeyeProblem
 
 # an unknown is as good as open when its standard deviation exceeds this: 5 degrees, 1 m, 0.1 s, a factor e
 USEFUL_ROTATION, USEFUL_TRANSLATION, USEFUL_CLOCK, USEFUL_LOG_SCALE = np.deg2rad(5.0), 1.0, 0.1, 1.0
+_ROUNDING = 1e-13  # an eigenvalue this small, beside a unit diagonal, is zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,14 +25,14 @@ class Equations:
     """Of all P unknowns over N steps.
 
     information: (P, P) `J^T W J`. scores: (N, P) gradients per step. weights: (N,) robust. used: (N,) steps
-    that entered. feigned: (P, P) what the noise alone contributes to `information`, if asked for.
+    that entered. feigned: (P, P) what the noise alone contributes to `information`.
     """
 
     information: Array
     scores: Array
     weights: Array
     used: NDArray[np.bool_]
-    feigned: Array | None = None
+    feigned: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,6 @@ def form_equations(
     filters: Sequence[Jitter],
     *,
     robust: bool,
-    with_feigned: bool = False,
 ) -> Equations:
     """Normal equations at `mountings`; `residuals` are theirs, `noise` that of the filtered residuals."""
     stacked = np.concatenate(residuals, axis=1)
@@ -85,7 +85,7 @@ def form_equations(
             weights[group.steps] = noise_model.robust_weights(squared, len(group.rows))
         used[group.steps] = True
         _add(information, scores, group, r, weights[group.steps], jacobians, columns)
-    feigned = _feigned(problem, steps, linear, groups, columns) if with_feigned else None
+    feigned = _feigned(problem, steps, linear, groups, columns)
     return Equations(information, scores, weights, used, feigned)
 
 
@@ -156,6 +156,50 @@ def _feigned(
                 at = columns[m].start + layout.clock.start
                 total[at, at] += 1.5 * len(group.steps) / problem.members[m].period_s ** 2
     return total
+
+
+@dataclass(frozen=True, eq=False)
+class Determined:
+    """What of the unknowns the equations determine.
+
+    basis: (P, q) directions along which the raw information is the identity. genuine: (q,) the share of it
+    that noise did not feign, in (0, 1]. open: (P, P - q) directions without genuine information, each as
+    long as its first unknown to become useless.
+    """
+
+    basis: Array
+    genuine: Array
+    open: Array
+
+
+def determined(equations: Equations, units: Array, doubt: float) -> Determined:
+    """Split the unknowns; a direction counts if its genuine information exceeds `doubt` times the feigned.
+
+    The matrix is scaled to unit diagonal first: only then are its small eigenvalues those of the motion and
+    not of rounding, for the unknowns differ by many decades.
+    """
+    diagonal = np.diag(equations.information)
+    scale = 1 / np.sqrt(np.maximum(diagonal, 1e-300))
+    scale[diagonal <= 0] = 0.0
+    values, vectors = np.linalg.eigh(equations.information * scale[:, None] * scale[None, :])
+    present = values > _ROUNDING
+    whitened = (vectors[:, present] * scale[:, None]) / np.sqrt(values[present])
+    absent = vectors[:, ~present] * np.where(scale > 0, scale, 1.0)[:, None]
+    genuine, turned = np.linalg.eigh(np.eye(whitened.shape[1]) - whitened.T @ equations.feigned @ whitened)
+    basis = whitened @ turned
+    solid = genuine > doubt * (1 - genuine)
+    open_ = np.concatenate([absent, basis[:, ~solid]], axis=1)
+    lengths = np.abs(open_ / units[:, None]).max(axis=0, initial=0.0)
+    return Determined(basis[:, solid], genuine[solid], open_ / np.maximum(lengths, 1e-300))
+
+
+def doubt_of(problem: HandeyeProblem, used: int) -> float:
+    """How much genuine information must exceed what is feigned.
+
+    With known noise the feigned information is known up to its scatter, of which five standard deviations
+    are asked for. Learnt levels, and their split between both sides, may be off by as much as themselves.
+    """
+    return 5.0 * float(np.sqrt(2 / max(used, 1))) if problem.has_known_noise else 1.0
 
 
 def useful_units(layouts: Sequence[Layout]) -> Array:

@@ -137,8 +137,8 @@ def _with_translation(motions: _Motions, rotation: Array, layout: Layout, segmen
     scales = np.ones(segments)
     if not layout.scale_count:
         right = (motions.reference.translation - way).ravel()
-        translation: Array = np.linalg.lstsq(lever.reshape(-1, 3), right, rcond=_WEAK)[0]
-        return SE3(rotation, translation), scales
+        translation = np.linalg.lstsq(lever.reshape(-1, 3), right, rcond=_WEAK)[0]
+        return SE3(rotation, np.asarray(translation, dtype=np.float64)), scales
     by_segment = np.zeros((*way.shape, segments))
     by_segment[np.arange(len(way)), :, motions.segments] = way
     sizes = np.linalg.norm(by_segment, axis=(0, 1))

@@ -18,6 +18,8 @@ from rigwake.handeye.information import (
     USEFUL_CLOCK,
     USEFUL_ROTATION,
     Equations,
+    determined,
+    doubt_of,
     form_equations,
     useful_units,
 )
@@ -28,8 +30,8 @@ from rigwake.handeye.values import HandeyeOptions
 
 _MOVES_LESS = 1e-3  # of a standard deviation: converged
 _SETTLED = 0.3  # of a standard deviation: near enough to learn the noise from the residuals
+_PATIENCE = 15  # steps
 _LONGEST_TURN = 0.5  # radians in one step
-_UNDETERMINED = 1e-4  # information, in useful units, that no step follows
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,7 @@ class Estimate:
     residuals: tuple[Array, ...]
     valid: NDArray[np.bool_]
     filters: tuple[Jitter, ...]
+    doubt: float
     iterations: int
     converged: bool
 
@@ -71,9 +74,9 @@ class _Solver:
         if self.covariances:
             return known_noise(frames, *self.over_steps)
         filtered = [f.apply(r) for f, r in zip(self.filters, self.residuals, strict=True)]
-        return learnt_noise(frames, np.concatenate(filtered, axis=1), self.valid)
+        return learnt_noise(frames, np.concatenate(filtered, axis=1), self.valid, self.problem.absolute)
 
-    def equations(self, *, with_feigned: bool = False) -> Equations:
+    def equations(self) -> Equations:
         return form_equations(
             self.problem,
             self.steps,
@@ -82,12 +85,12 @@ class _Solver:
             self.noise(),
             self.filters,
             robust=self.options.robust,
-            with_feigned=with_feigned,
         )
 
-    def step(self) -> float:
+    def step(self, doubt: float) -> float:
         """One Gauss-Newton step; its length in standard deviations."""
-        tangent, moved = _bounded_step(self.equations(), useful_units(self.problem.layouts))
+        equations = self.equations()
+        tangent, moved = _bounded_step(equations, useful_units(self.problem.layouts), doubt)
         ends = np.cumsum([layout.size for layout in self.problem.layouts])
         parts = np.split(tangent, ends[:-1])
         moves = zip(self.mountings, parts, self.problem.layouts, strict=True)
@@ -102,34 +105,40 @@ def maximise(problem: HandeyeProblem, start: Sequence[Mounting], options: Handey
     """Gauss-Newton from `start` until a step moves nothing by more than a thousandth of its deviation."""
     solver = _Solver(problem, start, options)
     learning = problem.noise == "estimated"
-    moved, iterations, settled = np.inf, 0, not learning
-    while (moved > _MOVES_LESS or not settled) and iterations < options.max_iterations:
+    doubt = doubt_of(problem, int(solver.valid.any(axis=1).sum()))
+    moved, iterations, settled, enough = np.inf, 0, not learning, _MOVES_LESS
+    while (moved > enough or not settled) and iterations < options.max_iterations:
         if learning and moved < _SETTLED:
             solver.learn_filters()
             settled = True
-        moved = solver.step()
+        moved = solver.step(doubt)
         iterations += 1
+        if iterations % _PATIENCE == 0:
+            # what comes and goes with every step is on the edge: a direction of being determined (give it
+            # up), a pose of the shared time (it moves the estimate by little)
+            doubt, enough = 2 * doubt, 10 * enough
     return Estimate(
         solver.mountings,
-        solver.equations(with_feigned=True),
+        solver.equations(),
         solver.residuals,
         solver.valid,
         solver.filters,
+        doubt,
         iterations,
-        moved <= _MOVES_LESS,
+        moved <= enough,
     )
 
 
-def _bounded_step(equations: Equations, units: Array) -> tuple[Array, float]:
-    """The Gauss-Newton step along the directions that anything determines, and its length in deviations."""
-    values, vectors = np.linalg.eigh(equations.information * units[:, None] * units[None, :])
-    gradient = vectors.T @ (equations.scores.sum(axis=0) * units)
-    known = values > _UNDETERMINED
-    coefficients = np.zeros_like(gradient)
-    coefficients[known] = -gradient[known] / values[known]
-    moved = float(np.sqrt(np.sum(coefficients[known] ** 2 * values[known])))
-    step = (vectors @ coefficients) * units
+def _bounded_step(equations: Equations, units: Array, doubt: float) -> tuple[Array, float]:
+    """The Gauss-Newton step along what is determined, and its length in standard deviations.
+
+    Along the rest the likelihood follows the noise, often towards infinity; it stays where it started.
+    """
+    basis = determined(equations, units, doubt).basis
+    coefficients = -(basis.T @ equations.scores.sum(axis=0))
+    step = basis @ coefficients
     limits = np.full(len(units), np.inf)
     limits[units == USEFUL_ROTATION] = _LONGEST_TURN
     limits[units == USEFUL_CLOCK] = USEFUL_CLOCK
-    return step * min(1.0, float(np.min(limits / np.maximum(np.abs(step), 1e-300)))), moved
+    shorten = min(1.0, float(np.min(limits / np.maximum(np.abs(step), 1e-300))))
+    return step * shorten, float(np.linalg.norm(coefficients))

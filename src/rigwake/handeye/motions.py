@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
+from rigwake.geometry.so3 import Array, hat
 from rigwake.handeye.resample import Sampled, small_adjoint
 
 
@@ -190,27 +190,26 @@ def feigned_information(
     """Information that the errors of the agreed motions add to `J^T W J` by themselves: (size, size).
 
     `E[dJ^T W dJ]` summed over the steps `chosen`, dJ the first-order effect of an error of covariance
-    `errors` in the member's tangent, W `weights` (both (1 or n, 6, 6)). Evaluated on some 300 of the steps.
+    `errors` in the member's tangent, W `weights` (both (1 or n, 6, 6)). Evaluated on some 100 of the steps.
     """
-    thinned = slice(None, None, max(1, len(chosen) // 300))
+    thinned = slice(None, None, max(1, len(chosen) // 100))
     some = chosen[thinned]
-    local = [x if len(x) == 1 else x[thinned] for x in (errors, weights)]
-    values, vectors = np.linalg.eigh(local[0])
-    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    J, adjoints, segments = linear.jacobians[some], linear.adjoints[some], steps.segments[some]
-    total = np.zeros((layout.size, layout.size))
-    for k in range(6):
-        error = roots[:, :, k]
-        moved = small_adjoint(error) @ adjoints
-        dJ = np.zeros_like(J)
-        if not layout.world_count:
-            dJ[:, :, :6] = moved
-        for world in range(layout.world_count):
-            here = segments == world
-            dJ[here, :, 6 + 6 * world : 12 + 6 * world] = moved[here]
-        for segment in range(layout.scale_count):
-            column = layout.scales.start + segment
-            turned = error[:, 3:] + np.cross(error[:, :3], J[:, 3:, column])
-            dJ[:, 3:, column] = -np.where((segments == segment)[:, None], turned, 0.0)
-        total += np.tensordot(np.swapaxes(dJ, 1, 2) @ local[1], dJ, axes=([0, 2], [0, 1]))
+    covariance, W = (x if len(x) == 1 else x[thinned] for x in (errors, weights))
+    values, vectors = np.linalg.eigh(covariance)
+    # six independent errors per step, first axis
+    error = np.moveaxis(vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :], 2, 0)
+    segments = steps.segments[some]
+    moved = small_adjoint(error) @ linear.adjoints[some]
+    dJ = np.zeros((6, len(some), 6, layout.size))
+    if not layout.world_count:
+        dJ[..., :6] = moved
+    for world in range(layout.world_count):
+        dJ[..., 6 + 6 * world : 12 + 6 * world] = np.where((segments == world)[:, None, None], moved, 0.0)
+    for segment in range(layout.scale_count):
+        column = layout.scales.start + segment
+        way = linear.jacobians[some, 3:, column]
+        turned = error[..., 3:] + (hat(error[..., :3]) @ way[:, :, None])[..., 0]
+        dJ[..., 3:, column] = -np.where((segments == segment)[:, None], turned, 0.0)
+    WdJ = W @ dJ
+    total = dJ.reshape(-1, layout.size).T @ WdJ.reshape(-1, layout.size)
     return total * (len(chosen) / len(some))

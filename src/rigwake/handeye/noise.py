@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
+from rigwake.geometry.so3 import Array, hat
 from rigwake.handeye.resample import Curve
 
 ROTATION_FLOOR = 1e-9  # rad; nothing is known better than rounding allows
@@ -63,41 +63,70 @@ def known_noise(mountings: Sequence[SE3], reference: Array, members: Sequence[Ar
     return StepNoise(total, of_reference)
 
 
-def learnt_noise(mountings: Sequence[SE3], residuals: Array, known: NDArray[np.bool_]) -> StepNoise:
-    """Noise levels from residuals (N, 6 M), `known` (N, M) where they are valid.
+def learnt_noise(
+    mountings: Sequence[SE3], residuals: Array, known: NDArray[np.bool_], by_axis: bool
+) -> StepNoise:
+    """Noise from residuals (N, 6 M), `known` (N, M) where they are valid.
 
-    Each trajectory gets one level for rotation and one for translation. More freedom (a full covariance)
-    would also absorb errors that grow with the motion, such as a wrong scale, and bend the estimate after
-    them. One member cannot tell whose error it is: then both sides are taken to be equally noisy.
+    Each trajectory gets a covariance (3, 3) for rotation and one for translation. With `by_axis` they are
+    free (a camera before a board knows its roll several times better than its tilt), else the same for all
+    axes: errors of odometry grow with the motion (a wrong scale, a misaligned gyroscope), a free covariance
+    would take them for noise and bend the estimate after them. One member cannot tell whose error it is:
+    then both sides are equally noisy.
     """
-    rotation = _levels(residuals, known, mountings, 0, np.zeros(len(mountings)))
-    # an error in rotation moves the member by the lever arm: E|r_t|^2 holds 2 |t|^2 var_a of it
-    arms = np.array([np.sum(X.translation**2) for X in mountings])
-    translation = _levels(residuals, known, mountings, 3, 2 * arms * rotation[0])
-    own = [np.diag(np.repeat([r, t], 3)) for r, t in zip(rotation, translation, strict=True)]
-    return known_noise(mountings, own[0][None], [c[None] for c in own[1:]])
+    count = len(mountings)
+    rotation, translation = [], []
+    for m, X in enumerate(mountings):
+        r = residuals[known[:, m], 6 * m : 6 * m + 6]
+        turned = _robust_covariance(r[:, :3], by_axis)
+        # an error of the reference's rotation moves the member by the lever arm
+        arm = hat(X.inverse().translation)
+        moved = _robust_covariance(r[:, 3:], by_axis) - arm @ turned @ arm.T / 2
+        if not by_axis:
+            moved = np.trace(moved) / 3 * np.eye(3)
+        values, vectors = np.linalg.eigh(moved)
+        kept = np.maximum(values, 0.05 * max(values[-1], 0.0) + TRANSLATION_FLOOR**2)
+        rotation.append(turned)
+        translation.append((vectors * kept) @ vectors.T)
+    members = [np.zeros((1, 6, 6)) for _ in range(count)]
+    reference = np.zeros((1, 6, 6))
+    for first, found in ((0, rotation), (3, translation)):
+        shares = _shares_of_reference(residuals, known, mountings, first)
+        block = slice(first, first + 3)
+        for m, X in enumerate(mountings):
+            members[m][0, block, block] = (1 - shares[m]) * found[m]
+            reference[0, block, block] += shares[m] / count * (X.rotation @ found[m] @ X.rotation.T)
+    return known_noise(mountings, reference, members)
 
 
-def _levels(
-    residuals: Array, known: NDArray[np.bool_], mountings: Sequence[SE3], first: int, explained: Array
+def _shares_of_reference(
+    residuals: Array, known: NDArray[np.bool_], mountings: Sequence[SE3], first: int
 ) -> Array:
-    """Variances per axis `[reference, members...]` of the three rows from `first` of every member."""
-    parts = [residuals[:, 6 * m + first : 6 * m + first + 3] for m in range(len(mountings))]
-    squares = np.array(
-        [
-            max(_robust_mean(np.sum(r[known[:, m]] ** 2, axis=1)) - explained[m], 1e-3 * explained[m]) / 3
-            for m, r in enumerate(parts)
-        ]
-    )  # of reference and member together
+    """How much of every member's variance (three rows from `first`) is the reference's: what two share."""
+    axes = [residuals[:, 6 * m + first : 6 * m + first + 3] @ X.rotation.T for m, X in enumerate(mountings)]
+    own = [_robust_mean(np.sum(r[known[:, m]] ** 2, axis=1)) for m, r in enumerate(axes)]
     shared = [
-        np.mean(np.sum((r @ X.rotation.T) * (other @ Y.rotation.T), axis=1)[known[:, m] & known[:, n]]) / 3
-        for m, (r, X) in enumerate(zip(parts, mountings, strict=True))
-        for n, (other, Y) in enumerate(zip(parts[:m], mountings[:m], strict=True))
+        float(np.mean(np.sum((r * other)[known[:, m] & known[:, n]], axis=1)))
+        for m, r in enumerate(axes)
+        for n, other in enumerate(axes[:m])
         if (known[:, m] & known[:, n]).sum() > 30
     ]
-    smallest = float(squares.min())
-    reference = float(np.clip(np.mean(shared), 0.1 * smallest, 0.9 * smallest)) if shared else smallest / 2
-    return np.array([reference, *(squares - reference)])
+    if not shared:
+        return np.full(len(mountings), 0.5)
+    return np.clip(np.mean(shared) / np.maximum(own, 1e-300), 0.1, 0.9)
+
+
+def _robust_covariance(rows: Array, by_axis: bool) -> Array:
+    """Covariance (3, 3) about zero with outliers pulled in (Huber's proposal 2)."""
+    floor = ROTATION_FLOOR**2 * np.eye(3)
+    covariance = _robust_mean(np.sum(rows**2, axis=1)) / 3 * np.eye(3) + floor
+    if not by_axis:
+        return np.asarray(covariance)
+    for _ in range(2):
+        squared = np.einsum("ni,ij,nj->n", rows, np.linalg.inv(covariance), rows)
+        pulled = rows * np.sqrt(np.minimum(1.0, _CHI2_LIMIT / np.maximum(squared, 1e-300)))[:, None]
+        covariance = pulled.T @ pulled / max(len(rows), 1) + floor
+    return np.asarray(covariance)
 
 
 def _robust_mean(squared_lengths: Array) -> float:

@@ -16,53 +16,47 @@ import numpy as np
 from rigwake.calibration.values import UndeterminedDirection
 from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
 from rigwake.geometry.so3 import Array
-from rigwake.handeye.information import USEFUL_ROTATION, USEFUL_TRANSLATION, useful_units
+from rigwake.handeye.information import (
+    USEFUL_ROTATION,
+    USEFUL_TRANSLATION,
+    Equations,
+    determined,
+    useful_units,
+)
 from rigwake.handeye.likelihood import Estimate
 from rigwake.handeye.problem import HandeyeProblem
 
 _OPEN_UNITS = 10.0  # how far an open direction may be off: 50 degrees, 10 m
-_STANDS_OUT = 5.0  # standard deviations of the feigned information, when the noise is known
-_BLOCKS = 60  # of time, whose scores are taken to be independent
+_BLOCKS = 30  # of time, whose scores are taken to be independent
 _NEGLIGIBLE = 0.02  # component of a direction that is not worth naming
 
 
 def covariance(problem: HandeyeProblem, estimate: Estimate) -> Array:
     """Covariance of all unknowns, open directions included: (P, P).
 
-    Sandwich `H^-1 M H^-1` with H the information of the true motion. M is the raw information if the noise
-    is known; it exceeds H by what the errors of the Jacobians add. If the noise was learnt, M is not less
-    than the scatter of the scores over blocks of time, which holds correlation that no model foresaw.
+    Sandwich `H^-1 M H^-1` with H the genuine information. M is the raw information if the noise is known; it
+    exceeds H by what the errors of the Jacobians add. If the noise was learnt, M is not less than the
+    scatter of the scores over blocks of time, which holds correlation that no model foresaw.
     """
     equations = estimate.equations
     units = useful_units(problem.layouts)
-    assert equations.feigned is not None
-    scaling = units[:, None] * units[None, :]
-    raw, feigned = equations.information * scaling, equations.feigned * scaling
-    values, vectors = np.linalg.eigh(raw - feigned)
-    fake = np.einsum("ip,ij,jp->p", vectors, feigned, vectors)
-    doubt = _STANDS_OUT * np.sqrt(2 / max(equations.used.sum(), 1)) if problem.has_known_noise else 1.0
-    known = values > np.maximum(1.0, doubt * fake)
-    basis = vectors[:, known] / np.sqrt(values[known])  # H^-1 = basis basis^T
-    middle = basis.T @ raw @ basis
+    split = determined(equations, units, estimate.doubt)
+    middle = np.eye(len(split.genuine))
     if not problem.has_known_noise:
-        middle = _at_least(middle, basis.T @ (_scatter(equations.scores[equations.used]) * scaling) @ basis)
-    found = basis @ middle @ basis.T
-    unknown = vectors[:, ~known]
-    return np.asarray((found + _OPEN_UNITS**2 * unknown @ unknown.T) * scaling)
+        values, vectors = np.linalg.eigh(split.basis.T @ _scatter(equations) @ split.basis)
+        middle = (vectors * np.maximum(values, 1.0)) @ vectors.T
+    outer = split.basis / split.genuine
+    far = _OPEN_UNITS * split.open
+    whole = outer @ middle @ outer.T + far @ far.T
+    # rounding beside the large open directions: keeps every later change of axes positive definite
+    scaled = np.trace(whole / (units[:, None] * units[None, :]))
+    return np.asarray(whole + np.diag(4e-15 * scaled * units**2))
 
 
-def _scatter(scores: Array) -> Array:
+def _scatter(equations: Equations) -> Array:
+    scores = equations.scores[equations.used]
     blocks = np.array([part.sum(axis=0) for part in np.array_split(scores, min(_BLOCKS, len(scores)))])
     return np.asarray(blocks.T @ blocks * (len(blocks) / max(len(blocks) - 1, 1)))
-
-
-def _at_least(smaller: Array, larger: Array) -> Array:
-    """The second matrix, raised to the first in every direction in which it is less."""
-    root = np.linalg.cholesky(smaller)
-    inverse = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(inverse @ larger @ inverse.T)
-    mixed = root @ vectors
-    return np.asarray((mixed * np.maximum(values, 1.0)) @ mixed.T)
 
 
 def open_directions(
@@ -92,8 +86,16 @@ def _translations_first(wide: Array) -> list[Array]:
     padded = np.concatenate([singular, np.zeros(Vt.shape[0] - len(singular))])
     pure = basis @ Vt[padded < _NEGLIGIBLE].T
     rest = basis @ Vt[padded >= _NEGLIGIBLE].T
+    for coupled in rest.T:
+        if np.linalg.norm(coupled[3:]) > _NEGLIGIBLE:
+            # turning on moves the member along an arc: every offset across the axis is open with it
+            across = np.linalg.svd(coupled[None, :3])[2][1:]
+            pure = np.concatenate([pure, np.vstack([np.zeros((3, 2)), across.T])], axis=1)
+    basis, size, _ = np.linalg.svd(pure, full_matrices=False)
+    pure = basis[:, size > _NEGLIGIBLE]
     if pure.shape[1] == 3:
         pure = np.eye(6)[:, 3:]
+    rest[3:] -= pure[3:] @ (pure[3:].T @ rest[3:])
     return [*pure.T, *rest.T]
 
 

@@ -80,9 +80,9 @@ class HandeyeProblem:
 
 
 def pose_problem(
-    reference: Trajectory, members: Sequence[Trajectory], options: HandeyeOptions
+    reference: Trajectory, members: Sequence[Trajectory], options: HandeyeOptions, has_clock: Sequence[bool]
 ) -> HandeyeProblem:
-    """Choose unknowns, pace and noise model.
+    """Choose unknowns, pace and noise model; `has_clock` says whose time offset is an unknown.
 
     Raises UsageError for no members, equal names or a reference without metric scale.
     """
@@ -105,10 +105,10 @@ def pose_problem(
     layouts = tuple(
         Layout(
             curve.segment_count if noise == "poses" else 0,
-            options.time_offset,
+            clock,
             curve.segment_count if options.scale or not curve.trajectory.is_metric else 0,
         )
-        for curve in curves[1:]
+        for curve, clock in zip(curves[1:], has_clock, strict=True)
     )
     known = noise != "estimated" and all(
         t.name in options.levels or (t.covariances is not None and t.covariance_kind == noise)

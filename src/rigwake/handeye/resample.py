@@ -69,10 +69,13 @@ class Curve:
         return int(self.trajectory.segment_ids.max()) + 1
 
     def at(self, times_s: Array) -> Sampled:
-        """Interpolate at `times_s`, seconds after `start_ns`; times within a microsecond of a pose are that pose."""
+        """Interpolate at `times_s`, seconds after `start_ns`; a tenth of a period past either end is allowed.
+
+        Times within a nanosecond of a pose are that pose.
+        """
         times, n = self.times_s, len(self.times_s)
-        nearest = np.clip(np.searchsorted(times, times_s - 1e-6), 0, n - 1)
-        at_node = np.abs(times[nearest] - times_s) <= 1e-6
+        nearest = np.clip(np.searchsorted(times, times_s - 1e-9), 0, n - 1)
+        at_node = np.abs(times[nearest] - times_s) <= 1e-9
         segment_ids = self.trajectory.segment_ids
         assert segment_ids is not None
         if at_node.all():
@@ -80,11 +83,12 @@ class Curve:
             return Sampled(poses, self.twists[nearest], segment_ids[nearest])
         left = np.where(at_node, np.minimum(nearest, n - 2), np.clip(nearest - 1, 0, n - 2))
         span = times[left + 1] - times[left]
-        alpha = np.clip((times_s - times[left]) / span, 0.0, 1.0)
+        alpha = np.clip((times_s - times[left]) / span, -0.1, 1.1)
         alpha = np.where(at_node, (nearest > left) * 1.0, alpha)
         poses = self.trajectory.world_from_body[left] * SE3.exp(self._hermite(left, alpha, span))
         twists = self.twists[left] + alpha[:, None] * (self.twists[left + 1] - self.twists[left])
-        inside = (times_s >= times[0] - 1e-6) & (times_s <= times[-1] + 1e-6)
+        edge = 0.1 * self.period_s
+        inside = (times_s >= times[0] - edge) & (times_s <= times[-1] + edge)
         bridged = (span <= self.max_gap_s) & (segment_ids[left] == segment_ids[left + 1])
         known = inside & (bridged | at_node)
         return Sampled(poses, twists, np.where(known, segment_ids[nearest], -1))

@@ -1,0 +1,211 @@
+"""Hand-eye on real data: three devices without shared view, and a stereo camera whose answer is known.
+
+    python benchmarks/handeye_real.py [FOLDER OF REAL RECORDINGS]
+
+`tango_triplet`: three rigidly mounted visual-inertial devices with unsynchronised clocks. Without a truth, the
+checks are the loop of the three pairwise results and the agreement of the two halves of the recording.
+`euroc_aprilgrid`: two cameras before a board, a trajectory of each by PnP; hand-eye never uses that both see the
+same board, and is compared with the transform taken frame by frame from the shared board.
+"""
+
+from __future__ import annotations
+
+import gzip
+import os
+import sys
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from rigwake.geometry import so3
+from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
+from rigwake.handeye.calibrate import calibrate_handeye
+from rigwake.handeye.values import HandeyeOptions
+from rigwake.readers.trajectories import read_trajectory
+from rigwake.trajectory import Trajectory
+
+TANGO = {
+    "caligula": "CALIGULA_20170405_195215",
+    "mars": "MARS_20170405_195216",
+    "nero": "NERO_20170405_195219",
+}
+EUROC_INTRINSICS = {  # published: fx fy cx cy, k1 k2 p1 p2
+    "cam0": ([458.654, 457.296, 367.215, 248.375], [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]),
+    "cam1": ([457.587, 456.134, 379.999, 255.238], [-0.28368365, 0.07451284, -0.00010473, -3.555e-05]),
+}
+EUROC_CAM0_FROM_CAM1 = SE3(  # published
+    so3.nearest_rotation(
+        [
+            [0.999997256478, -0.002317135723, -0.000343393121],
+            [0.002312067192, 0.999898048507, -0.014090668453],
+            [0.000376008102, 0.014089835847, 0.999900662638],
+        ]
+    ),
+    np.array([0.1100741378, -0.000156612054, 0.000889382785]),
+)
+MIN_CORNERS = 24
+CORNER_STD_PX = 0.46  # residual of the fits
+
+
+def tango_trajectories(recordings: Path) -> dict[str, Trajectory]:
+    folder = recordings / "tango_triplet" / "TANGO_exCALIBur_1"
+    return {
+        name: read_trajectory(folder / f"{stem}.csv", name=name).trajectory for name, stem in TANGO.items()
+    }
+
+
+def degrees_and_mm(transform: SE3) -> tuple[float, float]:
+    turn = np.rad2deg(np.linalg.norm(so3.log(transform.rotation)))
+    return float(turn), float(1e3 * np.linalg.norm(transform.translation))
+
+
+def pairwise_loop(trajectories: dict[str, Trajectory]) -> tuple[float, float, float]:
+    """Degrees, millimetres and milliseconds by which three independent pairwise results do not close."""
+    names = list(trajectories)
+    loop, clock = SE3.identity(), 0.0
+    for a, b in zip(names, names[1:] + names[:1], strict=True):
+        result = calibrate_handeye(trajectories[a], [trajectories[b]])
+        loop = loop * result.ref_from_members[b]
+        clock += result.members[b].time_offset_s or 0.0
+    return *degrees_and_mm(loop), 1e3 * clock
+
+
+def halves(reference: Trajectory) -> tuple[Trajectory, Trajectory]:
+    first, last = int(reference.timestamps_ns[0]), int(reference.timestamps_ns[-1])
+    middle = (first + last) // 2
+    return reference.between(first, middle), reference.between(middle, last)
+
+
+@dataclass(frozen=True)
+class HalvesAgree:
+    """Per member: differences of the two halves about and along the axes of the reference, in sigmas."""
+
+    sigmas: dict[str, np.ndarray]
+    degrees_mm: dict[str, tuple[float, float]]
+    clock_ms: dict[str, float]
+
+
+def compare_halves(reference: Trajectory, members: list[Trajectory]) -> HalvesAgree:
+    first, second = (calibrate_handeye(half, members) for half in halves(reference))
+    sigmas, sizes, clocks = {}, {}, {}
+    for name, X in first.ref_from_members.items():
+        difference = X.local(second.ref_from_members[name])
+        covariance = first.members[name].covariance + second.members[name].covariance
+        turned = np.concatenate([X.rotation @ difference[:3], X.rotation @ difference[3:]])
+        sigmas[name] = turned / np.sqrt(np.diag(covariance_in_axes_of_a(X, covariance)))
+        sizes[name] = degrees_and_mm(SE3.exp(difference))
+        offsets = [r.members[name].time_offset_s or 0.0 for r in (first, second)]
+        clocks[name] = 1e3 * (offsets[1] - offsets[0])
+    return HalvesAgree(sigmas, sizes, clocks)
+
+
+def board_trajectory(recordings: Path, camera: str) -> Trajectory:
+    """`board_from_cam` of every frame by iterative PnP with the published intrinsics."""
+    path = recordings / "euroc_aprilgrid" / "imu_april" / f"{camera}.csv.gz"
+    with gzip.open(path, "rt") as stream:
+        stream.readline()
+        text = stream.read()
+    stamps = np.array([line.split(",", 1)[0] for line in text.splitlines()], dtype=np.int64)
+    values = np.loadtxt(text.splitlines(), delimiter=",", usecols=(3, 4, 5, 6, 7))
+    (fx, fy, cx, cy), distortion = EUROC_INTRINSICS[camera]
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    kept, rotations, translations, covariances = [], [], [], []
+    starts = np.flatnonzero(np.r_[True, np.diff(stamps) != 0])
+    for block, stamp in zip(np.split(values, starts[1:]), stamps[starts], strict=True):
+        if len(block) < MIN_CORNERS:
+            continue
+        found, turn, shift = cv2.solvePnP(
+            block[:, 2:].copy(), block[:, :2].copy(), matrix, np.array(distortion)
+        )
+        if found:
+            kept.append(stamp)
+            rotations.append(so3.exp(turn.ravel()))
+            translations.append(shift.ravel())
+            covariances.append(pnp_covariance(block[:, 2:], turn, shift, matrix, np.array(distortion)))
+    board_from_cam = SE3(np.array(rotations), np.array(translations)).inverse()
+    return Trajectory(camera, np.array(kept), board_from_cam, np.array(covariances), "poses")
+
+
+def pnp_covariance(
+    points: np.ndarray, turn: np.ndarray, shift: np.ndarray, matrix: np.ndarray, distortion: np.ndarray
+) -> np.ndarray:
+    """Covariance of `board_from_cam`, right tangent d: `cam_from_board -> exp(-d) cam_from_board`."""
+    _, jacobian = cv2.projectPoints(np.ascontiguousarray(points), turn, shift, matrix, distortion)
+    by_turn, by_shift = jacobian[:, :3], jacobian[:, 3:6]
+    by_rotation = by_shift @ so3.hat(shift.ravel()) - by_turn @ so3.left_jacobian_inverse(turn.ravel())
+    J = np.hstack([by_rotation, -by_shift])
+    return np.linalg.inv(J.T @ J) * CORNER_STD_PX**2
+
+
+def direct_transform(first: Trajectory, second: Trajectory) -> SE3:
+    """`first_from_second` from the shared board: mean over the frames that both see it in."""
+    _, i, j = np.intersect1d(first.timestamps_ns, second.timestamps_ns, return_indices=True)
+    each = first.world_from_body[i].inverse() * second.world_from_body[j]
+    return SE3(so3.nearest_rotation(each.rotation.mean(axis=0)), each.translation.mean(axis=0))
+
+
+@dataclass(frozen=True)
+class EurocCheck:
+    """Degrees and millimetres of hand-eye from the direct transform, and of both from the published one."""
+
+    from_direct: tuple[float, float]
+    from_published: tuple[float, float]
+    direct_from_published: tuple[float, float]
+    clock_ms: float
+
+
+def check_euroc(recordings: Path, noise: str | None, *, pnp_covariances: bool) -> EurocCheck:
+    cameras = [board_trajectory(recordings, name) for name in ("cam0", "cam1")]
+    if not pnp_covariances:
+        cameras = [replace(camera, covariances=None) for camera in cameras]
+    result = calibrate_handeye(cameras[0], [cameras[1]], HandeyeOptions(noise=noise))
+    found, direct = result.ref_from_members["cam1"], direct_transform(*cameras)
+    return EurocCheck(
+        degrees_and_mm(direct.inverse() * found),
+        degrees_and_mm(EUROC_CAM0_FROM_CAM1.inverse() * found),
+        degrees_and_mm(EUROC_CAM0_FROM_CAM1.inverse() * direct),
+        1e3 * (result.members["cam1"].time_offset_s or 0.0),
+    )
+
+
+def main() -> None:
+    beside = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
+    recordings = Path(sys.argv[1] if len(sys.argv) > 1 else os.environ.get("RIGWAKE_DATA", beside))
+    if not recordings.is_dir():
+        print(f"no real recordings at {recordings}: name their folder, or set RIGWAKE_DATA")
+        return
+    devices = tango_trajectories(recordings)
+    turn, shift, clock = pairwise_loop(devices)
+    print("| what | measured | physical limit |\n|---|---|---|")
+    print(
+        f"| tango_triplet: three pairwise results around the loop | {turn:.4f} deg, {shift:.2f} mm, "
+        f"{clock:+.2f} ms | 0 |"
+    )
+    names = list(devices)
+    joint = calibrate_handeye(devices[names[0]], [devices[n] for n in names[1:]])
+    a, b = (joint.ref_from_members[n] for n in names[1:])
+    closed = degrees_and_mm(a * (a.inverse() * b) * b.inverse())
+    print(f"| the same, joint solve | {closed[0]:.1e} deg, {closed[1]:.1e} mm | 0 |")
+    for a_name, b_name in combinations(devices, 2):
+        agree = compare_halves(devices[a_name], [devices[b_name]])
+        print(
+            f"| {a_name}-{b_name}: halves | worst axis {np.abs(agree.sigmas[b_name]).max():.2f} sigma, "
+            f"{agree.degrees_mm[b_name][0]:.3f} deg, {agree.degrees_mm[b_name][1]:.1f} mm, "
+            f"{agree.clock_ms[b_name]:+.2f} ms | 3 sigma |"
+        )
+    for noise, covariances in (("poses", False), ("poses", True), (None, False)):
+        check = check_euroc(recordings, noise, pnp_covariances=covariances)
+        kind = f"noise {noise or 'estimated'}{', covariances of PnP' if covariances else ''}"
+        print(
+            f"| euroc_aprilgrid, {kind} | from the direct transform {check.from_direct[0]:.3f} deg, "
+            f"{check.from_direct[1]:.2f} mm; from the published one {check.from_published[0]:.3f} deg, "
+            f"{check.from_published[1]:.2f} mm; clock {check.clock_ms:+.3f} ms | direct from published "
+            f"{check.direct_from_published[0]:.3f} deg, {check.direct_from_published[1]:.2f} mm |"
+        )
+
+
+if __name__ == "__main__":
+    main()

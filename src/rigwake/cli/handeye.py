@@ -1,0 +1,173 @@
+"""`rigwake handeye`: a rig from trajectories that any odometry made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from rigwake.cli.console import err, next_step, out, write_json
+from rigwake.errors import UsageError
+
+if TYPE_CHECKING:
+    from rigwake.calibration import CalibratedCamera
+    from rigwake.handeye.values import HandeyeResult
+    from rigwake.trajectory import Trajectory
+
+
+def command(
+    reference: Annotated[Path, typer.Argument(help="Trajectory of the reference, metric.")],
+    others: Annotated[list[Path], typer.Argument(help="Trajectories of the others, one file each.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write calibration.yaml here.")
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the result to this file ('-': print).")
+    ] = None,
+    method: Annotated[
+        str, typer.Option(help="`ml`: maximum likelihood; `seed`: the linear baseline.")
+    ] = "ml",
+    noise: Annotated[
+        str,
+        typer.Option(
+            help="Errors independent in the `increments` (odometry), in the `poses` (GNSS/INS, boards), or "
+            "`estimated`; `auto`: as covariances beside the files say, else estimated."
+        ),
+    ] = "auto",
+    time_offset: Annotated[
+        bool, typer.Option("--time-offset/--no-time-offset", help="Estimate the clocks of the others.")
+    ] = True,
+    scale: Annotated[
+        bool, typer.Option("--scale", help="Estimate a scale of the others although they claim to be metric.")
+    ] = False,
+) -> None:
+    """Where bodies sit on one rig, from one trajectory of each: no shared view, any clock, any origin.
+
+    Formats: TUM, KITTI, EuRoC, csv with header.
+    Example: [cyan]rigwake handeye imu.tum port.tum starboard.tum -o calibration.yaml[/cyan]
+    """
+    from rigwake.calibration import save_calibration
+    from rigwake.handeye.calibrate import calibrate_handeye
+    from rigwake.handeye.values import HandeyeOptions
+
+    if method not in ("ml", "seed"):
+        raise UsageError(f"--method {method!r} is unknown.", remedy="Choose ml or seed.")
+    if noise not in ("auto", "estimated", "increments", "poses"):
+        raise UsageError(
+            f"--noise {noise!r} is unknown.", remedy="Choose auto, estimated, increments or poses."
+        )
+    trajectories = [_read(path) for path in (reference, *others)]
+    options = HandeyeOptions(
+        method="seed" if method == "seed" else "ml",
+        noise=None if noise == "auto" else noise,  # type: ignore[arg-type]
+        time_offset=time_offset,
+        scale=scale,
+    )
+    result = calibrate_handeye(trajectories[0], trajectories[1:], options)
+    if output is not None:
+        provenance = {"command": "handeye", "inputs": [str(p) for p in (reference, *others)]}
+        save_calibration(result.calibration({**provenance, "method": method, "noise": result.noise}), output)
+    if json_file is not None:
+        write_json(json_file, result_to_json(result))
+        if str(json_file) == "-":
+            return
+    _print(result)
+    if output is not None:
+        next_step(f"rigwake export {output} --to kalibr -o camchain.yaml", "load it into other tools")
+    else:
+        files = " ".join(str(p) for p in (reference, *others))
+        next_step(f"rigwake handeye {files} -o calibration.yaml", "keep the result")
+
+
+def _read(path: Path) -> Trajectory:
+    from rigwake.readers.trajectories import read_trajectory
+
+    read = read_trajectory(path)
+    for finding in read.findings:
+        err.print(f"[yellow]{escape(path.name)}: {escape(finding.message)}[/yellow]")
+    return read.trajectory
+
+
+def result_to_json(result: HandeyeResult) -> dict[str, Any]:
+    """The result as plain values; null wherever the motion determined nothing."""
+    return {
+        "reference": result.reference,
+        "members": {name: _member_to_json(result, camera) for name, camera in result.members.items()},
+        "noise": result.noise,
+        "steps": result.steps,
+        "down_weighted": result.down_weighted,
+        "iterations": result.iterations,
+    }
+
+
+def _member_to_json(result: HandeyeResult, camera: CalibratedCamera) -> dict[str, Any]:
+    turned = camera.rig_from_cam.rotation
+    quaternion = camera.rig_from_cam.quat_wxyz if bool((turned == turned).all()) else [float("nan")] * 4
+    return {
+        "ref_from_member": {
+            "quat_wxyz": _plain(quaternion),
+            "translation_m": _plain(camera.rig_from_cam.translation),
+        },
+        "std": {
+            "rotation_deg": _plain(camera.std_rotation_deg),
+            "translation_m": _plain(camera.std_translation_m),
+        },
+        "time_offset_s": camera.time_offset_s,
+        "time_offset_std_s": camera.time_offset_std_s,
+        "scale": _plain([camera.scale])[0],
+        "scale_std": _plain([camera.scale_std])[0],
+        "segment_scales": [_plain(pair) for pair in result.scales[camera.name]],
+        "unobservable": [
+            {"direction": _plain(d.direction), "words": d.words, "remedy": d.remedy}
+            for d in camera.undetermined
+        ],
+        "known_offsets": [
+            {"direction": _plain(k.direction_rig), "value_m": k.value_m, "std_m": k.std_m}
+            for k in camera.known_offsets
+        ],
+    }
+
+
+def _plain(values: Any) -> list[float | None]:
+    """Floats, None where not finite."""
+    numbers = [None if v is None else float(v) for v in values]
+    return [None if v is None or v - v != 0 else v for v in numbers]
+
+
+def _print(result: HandeyeResult) -> None:
+    import numpy as np
+
+    table = Table(title=f"mountings in {result.reference} (rotation vector and offset, ± standard deviation)")
+    for heading in ("member", "axis", "rotation °", "offset m", "clock s", "scale"):
+        table.add_column(heading, justify="left" if heading in ("member", "axis") else "right")
+    for name, camera in result.members.items():
+        from rigwake.geometry import so3
+
+        known = bool(np.isfinite(camera.rig_from_cam.rotation).all())
+        turn = np.rad2deg(so3.log(camera.rig_from_cam.rotation)) if known else np.full(3, np.nan)
+        for i, axis in enumerate("xyz"):
+            first = i == 0
+            table.add_row(
+                name if first else "",
+                axis,
+                _figure(turn[i], camera.std_rotation_deg[i], 3),
+                _figure(camera.rig_from_cam.translation[i], camera.std_translation_m[i], 4),
+                _figure(camera.time_offset_s, camera.time_offset_std_s, 5) if first else "",
+                _figure(camera.scale, camera.scale_std, 4) if first else "",
+            )
+    out.print(table)
+    out.print(f"noise: {result.noise}; {result.steps} steps, {result.down_weighted} down-weighted")
+    for camera in result.members.values():
+        for d in camera.undetermined:
+            out.print(f"[yellow]not determined: {escape(d.words)}.[/yellow] {escape(d.remedy)}")
+
+
+def _figure(value: float | None, std: float | None, digits: int) -> str:
+    if value is None or value - value != 0:
+        return "–"
+    if std is None or std - std != 0:
+        return f"{value:+.{digits}f}"
+    return f"{value:+.{digits}f} ± {std:.{digits}f}"
