@@ -12,7 +12,7 @@ from rigwake.errors import InputError
 from rigwake.geometry import so3
 from rigwake.geometry.geodesy import enu_from_lla
 from rigwake.geometry.so3 import Array
-from rigwake.readers.streams import symmetric_psd, usable_rows
+from rigwake.readers.streams import symmetric_psd, unit_quaternions, usable_rows
 from rigwake.readers.tables import Table, read_table
 from rigwake.recording import AttitudeStream, Finding, GnssStream, ImuStream, Stamps
 
@@ -93,8 +93,7 @@ def read_gnss_csv(path: Path, name: str) -> tuple[GnssStream, Findings]:
 def read_attitude_csv(path: Path, name: str) -> tuple[AttitudeStream, Findings]:
     """Attitude `qw qx qy qz` of the body in ENU, with covariances `cov_xx ... cov_zz` about body axes."""
     table = read_table(path)
-    quat_wxyz = table.numbers(("qw", "qx", "qy", "qz"))
-    quat_wxyz[np.abs(np.linalg.norm(quat_wxyz, axis=1) - 1) > 0.05] = np.nan
+    quat_wxyz = unit_quaternions(table.numbers(("qw", "qx", "qy", "qz")))
     rows, stamps, findings = _usable(table, name, quat_wxyz)
     rotations = so3.matrix_from_quat_wxyz(quat_wxyz[rows])
     covariances = symmetric_psd(_symmetric(table, _BODY_COVARIANCE, rows), np.radians(5.0) ** 2)

@@ -14,7 +14,7 @@ from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
 from rigwake.readers.channels import Channel
 from rigwake.readers.ros_messages import decode_all, stamped_rows, trailing_doubles
-from rigwake.readers.streams import symmetric_psd, usable_rows
+from rigwake.readers.streams import LARGEST_VALUE, symmetric_psd, unit_quaternions, usable_rows
 from rigwake.recording import AttitudeStream, Finding, GnssStream, ImuStream, Stamps
 from rigwake.trajectory import Trajectory
 
@@ -47,8 +47,7 @@ def read_imu(name: str, channel: Channel) -> tuple[ImuStream, AttitudeStream | N
 
 
 def _attitude(stream: ImuStream, quat_xyzw: Array, covariances: Array) -> AttitudeStream | None:
-    norms = np.linalg.norm(quat_xyzw, axis=1)
-    if not np.isfinite(quat_xyzw).all() or np.any(np.abs(norms - 1) > 0.05) or covariances[0, 0, 0] < 0:
+    if np.isnan(unit_quaternions(quat_xyzw)).any() or not covariances[0, 0, 0] >= 0:
         return None
     if np.ptp(quat_xyzw, axis=0).max() == 0:  # never filled in: identity all along
         return None
@@ -135,8 +134,7 @@ def pose_trajectory(
     name: str, timestamps_ns: Stamps, position: Array, quat_wxyz: Array
 ) -> tuple[Trajectory, Findings]:
     """A trajectory from raw poses, repaired. Raises InputError if none is usable."""
-    norms = np.linalg.norm(quat_wxyz, axis=1)
-    quat_wxyz = np.where((np.abs(norms - 1) < 0.05)[:, None], quat_wxyz, np.nan)
+    quat_wxyz = unit_quaternions(quat_wxyz)
     rows, findings = usable_rows(name, timestamps_ns, position, quat_wxyz)
     if not len(rows):
         raise InputError(f"{name} holds no readable pose.")
@@ -150,8 +148,7 @@ def tangent_covariances(stated: Array, world_from_body: SE3) -> Array | None:
 
     A pose `R exp(d_r)`, `p + R d_t` deviates by `R d_r` and `R d_t` in world axes, so `d = R^T (...)`.
     """
-    finite = np.isfinite(stated).all(axis=(1, 2))
-    if not finite.all() or not (np.einsum("nii->ni", stated) > 0).all():
+    if not (np.abs(stated) < LARGEST_VALUE).all() or not (np.einsum("nii->ni", stated) > 0).all():
         return None
     swapped = np.roll(stated, (3, 3), axis=(1, 2))
     B = np.zeros((len(stated), 6, 6))

@@ -12,6 +12,7 @@ from rigwake.geometry.se3 import SE3
 from rigwake.readers.channels import Channel
 from rigwake.readers.ros_messages import decode_all
 from rigwake.readers.ros_sensors import pose_trajectory
+from rigwake.readers.streams import LARGEST_VALUE, unit_quaternions
 from rigwake.recording import Finding
 from rigwake.trajectory import Trajectory
 
@@ -54,7 +55,7 @@ def _values(stamped: Any) -> tuple[float, ...]:
 
 def _single(stamped: Any) -> SE3:
     values = np.array(_values(stamped))
-    if not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1) > 0.05:
+    if not (np.abs(values) < LARGEST_VALUE).all() or np.isnan(unit_quaternions(values[None, 3:])).any():
         raise InputError("the transform is not finite or its quaternion not of unit length; it is left out.")
     return SE3.from_quat_wxyz(values[3:], values[:3])
 

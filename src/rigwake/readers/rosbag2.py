@@ -39,7 +39,7 @@ class SqlitePayloads:
             for row in rows:
                 try:
                     found = database.execute(query, (stored_limit, int(self.message_ids[row]))).fetchone()
-                except sqlite3.Error:
+                except (sqlite3.Error, UnicodeDecodeError):
                     found = None
                 stored = found[0] if found and isinstance(found[0], bytes) else b""
                 yield _unpacked(stored)[:limit_bytes] if self.packed else stored
@@ -55,6 +55,7 @@ def _unpacked(stored: bytes) -> bytes:
 
 def _connect(path: Path) -> sqlite3.Connection:
     database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)
+    database.text_factory = lambda text: text.decode("utf-8", "replace")
     database.execute("PRAGMA trusted_schema = OFF")
     return database
 
@@ -71,7 +72,7 @@ def index_sqlite(path: Path, *, packed: bool = False) -> BagIndex:
                 raise InputError(f"{path.name} is a database, but not a ROS 2 bag.")
             topics = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
             entries, problem = _message_entries(database)
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeDecodeError) as error:  # damaged names turn up in sqlite's own messages
         raise InputError(f"The ROS 2 bag {path.name} is damaged ({error}).") from error
     channels, findings = [], []
     if problem:
@@ -96,7 +97,7 @@ def _message_entries(database: sqlite3.Connection) -> tuple[Stamps, str]:
         for entry in database.execute("SELECT id, topic_id, timestamp FROM messages ORDER BY id"):
             if all(isinstance(value, int) for value in entry):
                 entries.append(entry)
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeDecodeError) as error:
         problem = str(error)
     return np.array(entries, dtype=np.int64).reshape(-1, 3), problem
 

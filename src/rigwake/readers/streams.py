@@ -10,6 +10,9 @@ from rigwake.recording import Finding, Stamps
 
 Rows = NDArray[np.int64]
 
+LARGEST_VALUE = 1e9
+"""No position (m), rate, force or variance of a vessel is larger: such a value is damage."""
+
 
 def time_order(sensor: str, timestamps_ns: Stamps) -> tuple[Rows, list[Finding]]:
     """Rows that put the stamps in strictly increasing order (of equal stamps the first stays), and what
@@ -30,31 +33,38 @@ def time_order(sensor: str, timestamps_ns: Stamps) -> tuple[Rows, list[Finding]]
     return order[fresh], findings
 
 
-def finite_rows(sensor: str, *columns: ArrayLike) -> tuple[Rows, list[Finding]]:
-    """Rows in which every column is finite, and how many were dropped."""
+def sane_rows(sensor: str, *columns: ArrayLike) -> tuple[Rows, list[Finding]]:
+    """Rows in which every column is finite and of possible size, and how many were dropped."""
     good = np.ones(len(np.asarray(columns[0])), dtype=bool)
     for column in columns:
         values = np.asarray(column, dtype=np.float64)
-        good &= np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+        sane = np.abs(values) < LARGEST_VALUE  # false for NaN
+        good &= sane.all(axis=tuple(range(1, values.ndim)))
     if good.all():
         return np.arange(len(good)), []
-    message = f"{int((~good).sum())} samples hold NaN or infinite values; they were dropped."
+    message = f"{int((~good).sum())} samples hold NaN, infinite or impossible values; they were dropped."
     return np.flatnonzero(good), [Finding("warning", sensor, message)]
 
 
 def usable_rows(sensor: str, timestamps_ns: Stamps, *columns: ArrayLike) -> tuple[Rows, tuple[Finding, ...]]:
     """Rows that are finite, in strictly increasing time order."""
-    finite, dropped = finite_rows(sensor, *columns)
-    order, sorted_findings = time_order(sensor, np.asarray(timestamps_ns)[finite])
-    return finite[order], (*dropped, *sorted_findings)
+    sane, dropped = sane_rows(sensor, *columns)
+    order, sorted_findings = time_order(sensor, np.asarray(timestamps_ns)[sane])
+    return sane[order], (*dropped, *sorted_findings)
+
+
+def unit_quaternions(quaternions: Array) -> Array:
+    """The quaternions (N, 4), NaN where they are not of unit length within 5 %."""
+    bounded = np.where(np.abs(quaternions) < 2, quaternions, np.nan)
+    is_unit = np.asarray(np.abs(np.linalg.norm(bounded, axis=1) - 1) < 0.05)  # false for NaN
+    return np.where(is_unit[:, None], bounded, np.nan)
 
 
 def symmetric_psd(covariances: Array, fallback: float) -> Array:
     """Covariances (N, k, k) made symmetric; those that are zero, negative or not finite become
     `fallback * I`."""
-    symmetric = (covariances + np.swapaxes(covariances, -1, -2)) / 2
-    finite = np.isfinite(symmetric).all(axis=(1, 2))
-    smallest = np.full(len(symmetric), -1.0)
-    smallest[finite] = np.linalg.eigvalsh(symmetric[finite])[:, 0]
-    unusable = smallest <= 0
+    sane = (np.abs(covariances) < LARGEST_VALUE).all(axis=(1, 2))
+    bounded = np.where(sane[:, None, None], covariances, 0.0)
+    symmetric = (bounded + np.swapaxes(bounded, -1, -2)) / 2
+    unusable = np.linalg.eigvalsh(symmetric)[:, 0] <= 0
     return np.where(unusable[:, None, None], fallback * np.eye(symmetric.shape[-1]), symmetric)
