@@ -15,7 +15,7 @@ from rigwake.cli.console import print_error
 from rigwake.errors import RigwakeError
 
 # one module per verb in this package, each with a function `command`; the order is that of --help
-VERBS: tuple[str, ...] = ("inspect", "handeye", "intrinsics", "evaluate", "diff", "export")
+VERBS: tuple[str, ...] = ("inspect", "handeye", "intrinsics", "evaluate", "diff", "export", "simulate")
 
 
 def _print_version(wanted: bool) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from rigwake.geometry.so3 import Array
 from rigwake.simulate.meshes import Floats, Mesh
@@ -17,7 +18,7 @@ from rigwake.simulate.textures import noise
 SUN_RADIANCE = 60.0  # of the (widened) disc; the sky is about 1
 SUN_COLOUR = np.array([1.0, 0.93, 0.8])
 SUN_IRRADIANCE = 2.6
-SKY_WIDTH, SKY_HEIGHT = 2048, 384
+SKY_WIDTH, SKY_HEIGHT = 1536, 320
 _SKY_DIRECTIONS = 8
 _OCCLUSION_REACH_M = 30.0
 
@@ -77,10 +78,10 @@ def _clouds(rng: np.random.Generator, ray: Array, cover: float) -> tuple[Array, 
     layer = noise(rng, 1.45, 1024, lowest=2)
     detail = noise(rng, 0.9, 1024, lowest=24)
     at = ray[..., :2] / (ray[..., 2:] + 0.13)
-    cell = np.floor(at * 120).astype(int) % 1024
-    blend = layer[cell[..., 1], cell[..., 0]] + 0.22 * detail[cell[..., 1], cell[..., 0]]
     if cover <= 0:
-        return np.zeros(blend.shape), np.zeros(blend.shape)
+        return np.zeros(ray.shape[:2]), np.zeros(ray.shape[:2])
+    cells = np.moveaxis(at * 90, -1, 0)
+    blend = map_coordinates(layer + 0.22 * detail, cells, order=1, mode="grid-wrap")
     threshold = np.quantile(layer, 1 - cover)
     opacity = np.clip((blend - threshold) * 1.5, 0, 1)
     thick = np.clip((blend - threshold) * 0.6, 0, 1)

@@ -70,7 +70,7 @@ def from_grid(points: Array, uv: Array, texture: int, tint: Colour) -> Mesh:
         triangles,
         corner_uv[:, :, order].reshape(-1, 3, 2).astype(np.float32),
         np.full(count, texture, np.int32),
-        np.broadcast_to(np.float32(tint), (count, 3)),
+        np.broadcast_to(np.array(tint, np.float32), (count, 3)),
     )
 
 
@@ -137,7 +137,7 @@ def _loose(triangles: Array, uv: Array, texture: int, tint: Colour) -> Mesh:
         triangles.astype(np.float32),
         uv.astype(np.float32),
         np.full(count, texture, np.int32),
-        np.broadcast_to(np.float32(tint), (count, 3)),
+        np.broadcast_to(np.array(tint, np.float32), (count, 3)),
     )
 
 

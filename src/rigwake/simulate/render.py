@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from embreex.rtcore_scene import EmbreeScene
@@ -22,7 +23,8 @@ from rigwake.simulate.structures import hull_mesh
 from rigwake.simulate.textures import Atlas
 from rigwake.simulate.waves import TILE_CELLS, WaveField
 
-_CHUNK = 1 << 17
+_CHUNK = 1 << 15
+_BLOCK_PX = 8  # rays are shot block by block: neighbours hit the same triangles and texels
 _LEVELS = 8
 
 
@@ -74,18 +76,13 @@ class Renderer:
         """Prepare a camera with `samples` rays per pixel (a square number), the hull traced once."""
         side = round(np.sqrt(samples))
         offsets = (np.arange(side) + 0.5) / side - 0.5
-        rays, pixel, width = [], [], []
-        for dv in offsets:
-            for du in offsets:
-                part = _lens_rays(model, du, dv)
-                rays.append(part[0])
-                pixel.append(part[1])
-                width.append(part[2] / side)
-        # sub-pixels of one pixel side by side: neighbouring rays hit the same triangles
-        all_pixels = np.concatenate(pixel)
-        order = np.argsort(all_pixels, kind="stable")
-        cam_rays = np.concatenate(rays)[order]
-        all_pixels, widths = all_pixels[order], np.concatenate(width)[order]
+        pixel_width = _pixel_widths(model) / np.float32(side)
+        parts = [_lens_rays(model, du, dv) for dv in offsets for du in offsets]
+        cam_rays = np.concatenate([rays for rays, _ in parts])
+        all_pixels = np.concatenate([pixel for _, pixel in parts])
+        order = np.argsort(_shooting_order(model)[all_pixels], kind="stable")
+        cam_rays, all_pixels = cam_rays[order], all_pixels[order]
+        widths = pixel_width[all_pixels]
         hull_hit, colour, normal, light = self._trace_hull(hull, rig_from_cam, cam_rays, widths)
         free = ~hull_hit
         return View(
@@ -110,7 +107,9 @@ class Renderer:
         light = sky_light(mesh, embree, self.sky)
         surfaces = _surfaces(mesh.uv, mesh.texture, mesh.tint, mesh.normals(), light, self.atlas, self.sky)
         directions = (cam_rays @ rig_from_cam.rotation.T).astype(np.float32)
-        hit = _cast(embree, np.broadcast_to(np.float32(rig_from_cam.translation), directions.shape), directions)
+        hit = _cast(
+            embree, np.broadcast_to(np.float32(rig_from_cam.translation), directions.shape), directions
+        )
         seen = hit["primID"] >= 0
         triangle, u, v = hit["primID"][seen], hit["u"][seen], hit["v"][seen]
         colour = np.empty((len(triangle), 3), np.float32)
@@ -132,7 +131,7 @@ class Renderer:
         image = np.zeros((height * width, 3), np.float32)
         rotation, centre = _per_row(view, world_from_rig)
         for start in range(0, len(view.pixel), _CHUNK):
-            rays = self._shoot(view, slice(start, start + _CHUNK), rotation, centre)
+            rays = self._shoot(view, slice(start, start + _CHUNK), rotation, centre, water.bound)
             out = _empty_mirrored(len(rays.pixel))
             count = shading.shade(self.surfaces, water, rays, out, image)
             if count:
@@ -143,7 +142,9 @@ class Renderer:
                 )
         middle = rotation[height // 2] @ view.rig_from_cam.rotation.T
         sun_rig = middle.T @ self.sky.sun
-        shading.shade_hull(view.hull_albedo, view.hull_normal, view.hull_light, view.hull_pixel, sun_rig, image)
+        shading.shade_hull(
+            view.hull_albedo, view.hull_normal, view.hull_light, view.hull_pixel, sun_rig, image
+        )
         return np.asarray(image.reshape(height, width, 3) / view.samples, np.float32)
 
     def truth(self, view: View, world_from_rig: SE3, water: Water) -> TruthImage:
@@ -154,15 +155,16 @@ class Renderer:
         labels[view.hull_pixel] = shading.HULL
         rotation, centre = _per_row(view, world_from_rig)
         for start in range(0, len(view.pixel), _CHUNK):
-            rays = self._shoot(view, slice(start, start + _CHUNK), rotation, centre)
+            rays = self._shoot(view, slice(start, start + _CHUNK), rotation, centre, water.bound)
             shading.classify(water, rays, labels, ranges)
         return TruthImage(labels.reshape(height, width), ranges.reshape(height, width))
 
-    def _shoot(self, view: View, part: slice, rotation: Array, centre: Array) -> Rays:
+    def _shoot(self, view: View, part: slice, rotation: Array, centre: Array, depth_m: float) -> Rays:
         rays = view.cam_rays[part]
         origin, direction = np.empty_like(rays), np.empty_like(rays)
-        shading.aim(rays, view.row[part], rotation, centre, origin, direction)
-        hit = self.embree.run(origin, direction, output=True)
+        reach = np.empty(len(rays), np.float32)
+        shading.aim(rays, view.row[part], rotation, centre, depth_m, origin, direction, reach)
+        hit = self.embree.run(origin, direction, reach, output=True)
         return Rays(
             origin,
             direction,
@@ -176,7 +178,13 @@ class Renderer:
 
 
 def _surfaces(
-    uv: Floats, texture: NDArray[np.int32], tint: Floats, normal: Floats, light: Floats, atlas: Atlas, sky: Sky
+    uv: Floats,
+    texture: NDArray[np.int32],
+    tint: Floats,
+    normal: Floats,
+    light: Floats,
+    atlas: Atlas,
+    sky: Sky,
 ) -> Surfaces:
     return Surfaces(
         uv,
@@ -194,7 +202,7 @@ def _surfaces(
     )
 
 
-def _cast(scene: EmbreeScene, origins: Floats, directions: Floats) -> dict[str, NDArray[np.generic]]:
+def _cast(scene: EmbreeScene, origins: Floats, directions: Floats) -> dict[str, NDArray[Any]]:
     """Hits of all rays, a chunk at a time."""
     parts = []
     for start in range(0, len(directions), _CHUNK):
@@ -203,21 +211,38 @@ def _cast(scene: EmbreeScene, origins: Floats, directions: Floats) -> dict[str, 
     return {key: np.concatenate([p[key] for p in parts]) for key in ("primID", "u", "v", "tfar")}
 
 
-def _lens_rays(model: CameraModel, du: float, dv: float) -> tuple[Floats, NDArray[np.int32], Floats]:
-    """Rays through pixel centres shifted by (du, dv): unit rays, pixel numbers, pixel widths in radians."""
-    width, height = model.width_px, model.height_px
-    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    pixels = np.stack([u.ravel() + du, v.ravel() + dv], 1)
-    rays, valid = model.unproject(pixels)
-    right, right_valid = model.unproject(pixels + [0.25, 0.0])
-    below, below_valid = model.unproject(pixels + [0.0, 0.25])
-    across = 4 * np.linalg.norm(right - rays, axis=1)
-    down = 4 * np.linalg.norm(below - rays, axis=1)
-    known = valid & right_valid & below_valid
-    typical = float(np.median(across[known])) if known.any() else 1e-3
-    size = np.where(known, np.sqrt(across * down), typical)
-    number = np.flatnonzero(valid).astype(np.int32)
-    return rays[valid].astype(np.float32), number, size[valid].astype(np.float32)
+def _pixel_grid(model: CameraModel) -> Array:
+    u, v = np.meshgrid(
+        np.arange(model.width_px, dtype=np.float64), np.arange(model.height_px, dtype=np.float64)
+    )
+    return np.stack([u.ravel(), v.ravel()], 1)
+
+
+def _lens_rays(model: CameraModel, du: float, dv: float) -> tuple[Floats, NDArray[np.int32]]:
+    """Unit rays through all pixel centres shifted by (du, dv) that the lens sees, and their pixel numbers."""
+    rays, valid = model.unproject(_pixel_grid(model) + np.array([du, dv]))
+    return rays[valid].astype(np.float32), np.flatnonzero(valid).astype(np.int32)
+
+
+def _pixel_widths(model: CameraModel) -> Floats:
+    """Angle (H*W,) across each pixel, radians: root of the product of the two directions."""
+    grid = _pixel_grid(model)
+    centre, right, below = (
+        model.unproject(grid + np.array(step))[0] for step in ((0, 0), (0.25, 0), (0, 0.25))
+    )
+    across, down = (4 * np.linalg.norm(other - centre, axis=1) for other in (right, below))
+    width = np.sqrt(across * down)
+    known = np.isfinite(width)
+    typical = float(np.median(width[known])) if known.any() else 1e-3
+    return np.where(known, width, typical).astype(np.float32)
+
+
+def _shooting_order(model: CameraModel) -> NDArray[np.int64]:
+    """Rank (H*W,) of each pixel when the image is worked through block by block."""
+    line, column = np.divmod(np.arange(model.height_px * model.width_px), model.width_px)
+    block = line // _BLOCK_PX * model.width_px + column // _BLOCK_PX
+    inside = line % _BLOCK_PX * _BLOCK_PX + column % _BLOCK_PX
+    return np.asarray(block * _BLOCK_PX**2 + inside)
 
 
 def _per_row(view: View, world_from_rig: SE3) -> tuple[Array, Array]:
@@ -259,6 +284,7 @@ def _water(sea: WaveField, time_s: float) -> Water:
         np.concatenate(cells).astype(np.float32),
         np.array(starts),
         lengths,
+        np.log2(lengths),
         np.array(lost, np.float32),
         max(highest, 1e-3),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 from rigwake.geometry.so3 import Array
 from rigwake.simulate import structures
@@ -219,14 +220,15 @@ def _hills(rng: np.random.Generator, layout: Layout, atlas: Atlas, density: floa
     height = _ground(layout, grid_x, grid_y, rugged)
     points = np.stack([grid_x, grid_y, height], -1)
     parts = [from_grid(points, points[..., :2], atlas.number("forest"), (1.1, 1.1, 1.0))]
+    height_at = RegularGridInterpolator((y, x), height)
     for _ in range(int(260 * density)):
         plan = rng.uniform(-0.75, 0.75, 2) * _REACH_M
-        ground = float(_ground(layout, plan[0], plan[1], np.float64(1.0)))
+        ground = float(height_at(plan[::-1])[0])
         if ground < 4.5:
             continue
         if rng.random() < 0.6:
             house = structures.building(rng, atlas, int(rng.integers(2, 6)), int(rng.integers(1, 3)), 9.0)
-            parts.append(house.moved(rng.uniform(0, 6.3), (*plan, ground - 3.5)))
+            parts.append(house.moved(rng.uniform(0, 6.3), (*plan, ground - 2.5)))
         else:
             parts.append(structures.tree(rng, atlas).moved(0.0, (*plan, ground - 1.0)))
     return join(parts)

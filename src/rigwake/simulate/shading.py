@@ -23,7 +23,11 @@ LAND, SKY, WATER, HULL = 60, 120, 180, 240
 _HAZE_M = 3500.0
 _HORIZON_M = 6000.0
 _CAPILLARY_VARIANCE = 6e-4  # slopes of ripples shorter than the shortest tile
-_HIGHEST = 3.0  # no wave reaches further than this many Hs from the still water
+
+# no `nnan`, `ninf`: misses are infinite. Inlined by LLVM: a call would copy the arrays' descriptors each time
+_FAST = {"contract", "reassoc", "arcp", "nsz", "afn"}
+_loop = numba.njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
+_inlined = numba.njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy", forceinline=True)
 
 
 class Surfaces(NamedTuple):
@@ -45,11 +49,12 @@ class Surfaces(NamedTuple):
 
 class Water(NamedTuple):
     """Tiles of height and slopes with their mip levels: (M, 3) cells, first cell by (tile, level), edge lengths in
-    metres, slope variance lost by (tile, level), bound of the height."""
+    metres and their base-2 logarithms, slope variance lost by (tile, level), bound of the height."""
 
     cells: Floats
     starts: Any
     lengths: Floats
+    octaves: Floats
     lost: Floats
     bound: float
 
@@ -80,7 +85,7 @@ class Mirrored(NamedTuple):
     glint: Floats
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True, inline="always")
+@_inlined
 def _bilinear(texels: Floats, start: int, size: int, u: float, v: float) -> tuple[float, float, float]:
     x, y = u * size - 0.5, v * size - 0.5
     fx, fy = math.floor(x), math.floor(y)
@@ -98,7 +103,7 @@ def _bilinear(texels: Floats, start: int, size: int, u: float, v: float) -> tupl
     )
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@_inlined
 def _texture(s: Surfaces, number: int, u_m: float, v_m: float, width_m: float) -> tuple[float, float, float]:
     """Colour of a texture at metres along a surface, averaged over a width: trilinear in the mip pyramid."""
     edge, size = s.metres[number], s.sizes[number, 0]
@@ -114,14 +119,14 @@ def _texture(s: Surfaces, number: int, u_m: float, v_m: float, width_m: float) -
     return r + share * (r1 - r), g + share * (g1 - g), b + share * (b1 - b)
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@_inlined
 def _sky(s: Surfaces, dx: float, dy: float, dz: float) -> tuple[float, float, float]:
     height, width = s.panorama.shape[0], s.panorama.shape[1]
     if dz <= 0:
         return s.horizon[0], s.horizon[1], s.horizon[2]
     y = min(math.sqrt(dz) * height, height - 1.001)
     x = (math.atan2(dy, dx) / (2 * math.pi)) % 1.0 * width - 0.5
-    x0, y0 = int(math.floor(x)), int(y)
+    x0, y0 = math.floor(x), int(y)
     ax, ay = x - x0, y - y0
     x0 %= width
     x1 = (x0 + 1) % width
@@ -138,7 +143,7 @@ def _sky(s: Surfaces, dx: float, dy: float, dz: float) -> tuple[float, float, fl
     return r, g, b
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@_inlined
 def _land(
     s: Surfaces,
     triangle: int,
@@ -168,13 +173,7 @@ def _land(
     )
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
-def _water_level(water: Water, tile: int, width_m: float) -> float:
-    size = 256.0
-    return min(max(math.log2(max(width_m * size / water.lengths[tile], 1e-6)), 0.0), 7.0)
-
-
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@_inlined
 def _tile(water: Water, tile: int, level: int, x: float, y: float) -> tuple[float, float, float]:
     # +0.5: cell (0, 0) of level 0 lies at the origin, while `_bilinear` puts it half a cell away
     edge, size = water.lengths[tile], 256 >> level
@@ -182,7 +181,7 @@ def _tile(water: Water, tile: int, level: int, x: float, y: float) -> tuple[floa
     return _bilinear(water.cells, water.starts[tile, level], size, u, v)
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@_inlined
 def water_distance(
     water: Water,
     ox: float,
@@ -202,8 +201,9 @@ def water_distance(
         return np.inf
     t = -oz / dz
     seen = width * t / math.sqrt(max(-dz, 0.04))
-    level0 = int(_water_level(water, 0, seen) + 0.5)
-    level1 = int(_water_level(water, 1, seen) + 0.5)
+    octave = math.log2(max(seen, 1e-6)) + 8.5
+    level0 = int(min(max(octave - water.octaves[0], 0.0), 7.0))
+    level1 = int(min(max(octave - water.octaves[1], 0.0), 7.0))
     for _ in range(3):
         x, y = ox + t * dx, oy + t * dy
         h0, sx0, sy0 = _tile(water, 0, level0, x, y)
@@ -216,27 +216,30 @@ def water_distance(
     return t
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@_inlined
 def _slopes(water: Water, x: float, y: float, width_m: float) -> tuple[float, float, float]:
     """Slopes by x and y averaged over a width, and the variance of what that averages away."""
     sx = sy = 0.0
     lost = _CAPILLARY_VARIANCE
+    octave = math.log2(max(width_m, 1e-6)) + 8
     for tile in range(3):
-        level = _water_level(water, tile, width_m)
+        level = min(max(octave - water.octaves[tile], 0.0), 7.0)
         low = int(level)
+        if low == 7:  # a single cell, all averaged away
+            lost += water.lost[tile, 7]
+            continue
         share = level - low
         _, ax, ay = _tile(water, tile, low, x, y)
-        if share > 0.02 and low < 7:
+        if share > 0.02:
             _, bx, by = _tile(water, tile, low + 1, x, y)
             ax, ay = ax + share * (bx - ax), ay + share * (by - ay)
         sx += ax
         sy += ay
-        next_level = min(low + 1, 7)
-        lost += (1 - share) * water.lost[tile, low] + share * water.lost[tile, next_level]
+        lost += (1 - share) * water.lost[tile, low] + share * water.lost[tile, low + 1]
     return sx, sy, lost
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@_inlined
 def _mirror(
     s: Surfaces, water: Water, rays: Rays, i: int, t: float, out: Mirrored, k: int, image: Floats
 ) -> None:
@@ -275,7 +278,7 @@ def _mirror(
     out.width[k], out.travelled[k] = rays.width[i] + 0.6 * rough, width_m
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@_loop
 def shade(s: Surfaces, water: Water, rays: Rays, out: Mirrored, image: Floats) -> int:
     """Add each ray's colour to its pixel of `image` (P, 3); rays that meet water go on in `out`. Returns how many."""
     k = 0
@@ -298,7 +301,15 @@ def shade(s: Surfaces, water: Water, rays: Rays, out: Mirrored, image: Floats) -
             n = s.normal[triangle]
             cosine = abs(n[0] * dx + n[1] * dy + n[2] * dz)
             r, g, b = _land(
-                s, triangle, rays.u[i], rays.v[i], ox + t * dx, oy + t * dy, oz + t * dz, cosine, rays.width[i] * t
+                s,
+                triangle,
+                rays.u[i],
+                rays.v[i],
+                ox + t * dx,
+                oy + t * dy,
+                oz + t * dz,
+                cosine,
+                rays.width[i] * t,
             )
             haze = math.exp(-t / _HAZE_M)
             r, g, b = (
@@ -313,7 +324,7 @@ def shade(s: Surfaces, water: Water, rays: Rays, out: Mirrored, image: Floats) -
     return k
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@_loop
 def shade_mirrored(
     s: Surfaces, rays: Mirrored, distance: Floats, triangles: Any, u: Floats, v: Floats, image: Floats
 ) -> None:
@@ -337,7 +348,7 @@ def shade_mirrored(
         image[pixel, 2] += share * b + 0.8 * glint
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@_loop
 def shade_hull(
     albedo: Floats, normal: Floats, sky_light: Floats, pixel: Any, sun: Array, image: Floats
 ) -> None:
@@ -349,7 +360,7 @@ def shade_hull(
         image[pixel[i], 2] += albedo[i, 2] * (sky_light[i, 2] + 0.8 * lit)
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@_loop
 def surface_colours(s: Surfaces, triangles: Any, u: Floats, v: Floats, width_m: Floats, out: Floats) -> None:
     """Colours (N, 3) of points on triangles without any light."""
     for i in range(len(triangles)):
@@ -361,17 +372,29 @@ def surface_colours(s: Surfaces, triangles: Any, u: Floats, v: Floats, width_m: 
         out[i, 0], out[i, 1], out[i, 2] = r * tint[0], g * tint[1], b * tint[2]
 
 
-@numba.njit(nogil=True, cache=True)
-def aim(cam_rays: Floats, row: Any, rotation: Array, centre: Array, origin: Floats, direction: Floats) -> None:
-    """World rays of camera rays (N, 3) in image rows (N,), each row with its own pose (H, 3, 3), (H, 3)."""
+@_loop
+def aim(
+    cam_rays: Floats,
+    row: Any,
+    rotation: Array,
+    centre: Array,
+    depth_m: float,
+    origin: Floats,
+    direction: Floats,
+    reach: Floats,
+) -> None:
+    """World rays of camera rays (N, 3) in image rows (N,), each row with its own pose (H, 3, 3), (H, 3), and how
+    far they need to look: to `depth_m` below the still water."""
     for i in range(len(row)):
         R, c = rotation[row[i]], centre[row[i]]
         for a in range(3):
             direction[i, a] = R[a, 0] * cam_rays[i, 0] + R[a, 1] * cam_rays[i, 1] + R[a, 2] * cam_rays[i, 2]
             origin[i, a] = c[a]
+        down = -direction[i, 2]
+        reach[i] = (c[2] + depth_m) / down + 0.1 if down > 1e-4 else 1e6
 
 
-@numba.njit(nogil=True, cache=True)
+@_loop
 def classify(water: Water, rays: Rays, label: Any, ranges: Floats) -> None:
     """What each ray meets first, and how far away (inf: sky)."""
     for i in range(len(rays.pixel)):

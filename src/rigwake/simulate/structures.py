@@ -80,7 +80,7 @@ def building(rng: np.random.Generator, atlas: Atlas, bays: int, storeys: int, de
 
 def scaled(mesh: Mesh, along: float, up: float = 1.0) -> Mesh:
     """The mesh with its texture squeezed by these factors."""
-    return Mesh(mesh.triangles, mesh.uv * np.float32([along, up]), mesh.texture, mesh.tint)
+    return Mesh(mesh.triangles, mesh.uv * np.array([along, up], np.float32), mesh.texture, mesh.tint)
 
 
 def container_stack(rng: np.random.Generator, atlas: Atlas, rows: int) -> Mesh:

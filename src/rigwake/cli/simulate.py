@@ -1,0 +1,74 @@
+"""`rigwake simulate [SCENARIO] -o REC`: a recording of a harbour whose truth is known."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import yaml
+
+from rigwake.cli.console import next_step, out, progress_bar
+from rigwake.errors import UsageError
+from rigwake.simulate.record import build_world, render_recording, work_folder
+from rigwake.simulate.scenario import Scenario, build_scenario, load_scenario, preset_names
+from rigwake.simulate.setup import prepare
+from rigwake.simulate.truth import write_truth, write_truth_images
+from rigwake.writers.write import write_recording
+
+
+def command(
+    scenario: Annotated[
+        str, typer.Argument(help=f"A scenario file, or a preset: {', '.join(preset_names())}.")
+    ] = "demo",
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="REC.bag (ROS 1), REC.mcap (ROS 2) or a folder.")
+    ] = None,
+    duration: Annotated[float | None, typer.Option(help="Seconds, instead of the scenario's.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Another draw of sea, noise and (unless fixed) scene.")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Frames rendered at a time.")] = os.cpu_count() or 1,
+    truth_images: Annotated[bool, typer.Option(help="Also label and range images of every frame.")] = False,
+    show: Annotated[bool, typer.Option(help="Print the scenario as YAML and stop.")] = False,
+) -> None:
+    """Simulate a recording of any rig on a boat in a harbour, with its truth in REC_truth/."""
+    chosen = _changed(load_scenario(scenario), duration, seed)
+    if show:
+        print(yaml.safe_dump(chosen.model_dump(mode="json", exclude_none=True), sort_keys=False), end="")
+        return
+    if output is None:
+        raise UsageError("Where to? -o names the recording.", remedy="For example: -o harbour.bag")
+    if output.exists():
+        raise UsageError(f"{output} is already there.", remedy="Remove it, or choose another name.")
+    truth_folder = output.parent / f"{output.stem}_truth"
+    simulation = prepare(chosen)
+    work = work_folder(output, chosen)
+    with progress_bar() as bar:
+        task = bar.add_task("building the scene (compiles the first time)", total=1)
+
+        def show_progress(text: str, done: int, total: int) -> None:
+            bar.update(task, description=text, completed=done, total=total)
+
+        scenery, renderer = build_world(simulation)
+        recording = render_recording(simulation, renderer, work, workers=workers, progress=show_progress)
+        show_progress("writing", 0, 1)
+        findings = write_recording(recording, output)
+        write_truth(simulation, scenery.known_points_world, truth_folder)
+        if truth_images:
+            write_truth_images(simulation, renderer, truth_folder, show_progress)
+    shutil.rmtree(work)
+    frames = sum(len(camera) for camera in recording.cameras.values())
+    out.print(f"{output}: {len(recording.cameras)} cameras, {frames} frames, {chosen.duration_s:g} s.")
+    out.print(f"{truth_folder}: truth.yaml and true trajectories.")
+    for finding in findings:
+        out.print(f"[dim]{finding.sensor}: {finding.message}[/dim]")
+    next_step(f"rigwake inspect {output}", "see what was recorded")
+
+
+def _changed(scenario: Scenario, duration: float | None, seed: int | None) -> Scenario:
+    changes = {"duration_s": duration, "seed": seed}
+    given = {key: value for key, value in changes.items() if value is not None}
+    return build_scenario(scenario.model_dump() | given, scenario.name) if given else scenario

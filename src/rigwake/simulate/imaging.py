@@ -1,0 +1,78 @@
+"""From light to a stored picture: lens blur, vignetting, exposure, tone curve, noise, JPEG."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rigwake.cameras.base import CameraModel
+from rigwake.errors import EstimationError
+from rigwake.recording import Image
+from rigwake.simulate.meshes import Floats
+from rigwake.simulate.scenario import ImageNoise
+
+_EXPOSURE = 1.25
+_WHITE = 4.0
+_DRIFT_PERIOD_S = 23.0
+
+
+def tone_curve() -> Floats:
+    """Grey values of linear light 0..16 in 4096 even steps of its square root: extended Reinhard, then gamma 2.2."""
+    light = (np.arange(4096) / 4095 * 4.0) ** 2 * _EXPOSURE
+    display = light * (1 + light / _WHITE**2) / (1 + light)
+    return np.asarray(255 * np.clip(display, 0, 1) ** (1 / 2.2), np.float32)
+
+
+_TONE = tone_curve()
+
+
+def vignetting(model: CameraModel, loss: float) -> Floats:
+    """Relative light (H, W) at each pixel: 1 on the axis, `1 - loss` at the edge of the field of view, falling with
+    the square of the angle."""
+    u, v = np.meshgrid(
+        np.arange(model.width_px, dtype=np.float64), np.arange(model.height_px, dtype=np.float64)
+    )
+    rays, valid = model.unproject(np.stack([u.ravel(), v.ravel()], 1))
+    angle = np.arccos(np.clip(np.where(valid, rays[:, 2], 1.0), -1, 1))
+    return np.asarray(1 - loss * (angle / model.max_angle) ** 2, np.float32).reshape(u.shape)
+
+
+def develop(
+    light: Floats,
+    noise: ImageNoise,
+    vignette: Floats,
+    time_s: float,
+    phase: float,
+    rng: np.random.Generator,
+) -> Image:
+    """An 8-bit BGR picture (H, W, 3) of linear RGB light (H, W, 3).
+
+    The exposure is `gain (1 + gain_drift sin(..))`, wandering over 23 s from a phase of the camera's own.
+    """
+    if noise.blur_px > 0:
+        light = cv2.GaussianBlur(light, (0, 0), noise.blur_px, borderType=cv2.BORDER_REPLICATE)
+    gain = noise.gain * (1 + noise.gain_drift * np.sin(2 * np.pi * time_s / _DRIFT_PERIOD_S + phase))
+    exposed = np.sqrt(np.clip(light * (vignette * gain)[..., None], 0, 15.9)) * (4095 / 4)
+    grey = _TONE[exposed.astype(np.int32)]
+    if noise.read_std > 0 or noise.shot > 0:
+        grain = rng.standard_normal(grey.shape, dtype=np.float32)
+        grey = grey + grain * np.sqrt(noise.read_std**2 + noise.shot * grey)
+    return np.asarray(np.clip(grey[..., ::-1] + 0.5, 0, 255), np.uint8)
+
+
+def encode(picture: Image, quality: int, colour: bool) -> bytes:
+    """JPEG bytes of a BGR picture, grey if not `colour`."""
+    stored = picture if colour else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    done, buffer = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise EstimationError(
+            "OpenCV could not encode a picture as JPEG.", remedy="Check the installation of OpenCV."
+        )
+    return bytes(buffer)
+
+
+def decode(encoded: NDArray[np.uint8], colour: bool) -> Image | None:
+    """The picture in JPEG bytes, BGR or grey; None if they are broken."""
+    picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE)
+    return None if picture is None else np.asarray(picture, np.uint8)
