@@ -9,7 +9,7 @@ fixes vertical offsets on calm water.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +40,8 @@ class HandOverOptions:
     """
 
     views_per_camera: int = 4
-    max_searches: int = 12000
-    search_px: float = 4.0
+    max_searches: int = 6000
+    search_px: float = 3.5
     max_view_angle_deg: float = 30.0
     max_stretch: float = 1.7
     min_gap_s: float = 4.0
@@ -288,8 +288,11 @@ def find_landmarks(
         rows = np.flatnonzero(searches.cameras == camera)
         for coefficients, here in _images(streams[name], searches.stamps[rows]):
             at = rows[here]
-            found, spread = _look_around(coefficients, references.take(at), shape, searches.take(at), options)
-            pixels[at], std_px[at] = found, spread
+            wanted = np.zeros(len(searches), dtype=bool)
+            wanted[at] = True
+            pixels[at], std_px[at] = _look_around(
+                coefficients, references.take(wanted), shape, searches.take(at), options
+            )
     agreed = np.flatnonzero(np.isfinite(std_px))
     return Observations(
         searches.cameras[agreed],
@@ -317,9 +320,7 @@ def _cut_patches(
         return make_references(np.zeros((16, 16), np.float32), np.empty((0, 2)), shape)[0], np.empty(
             0, np.int64
         )
-    joined = parts[0]
-    for part in parts[1:]:
-        joined = joined.join(part)
+    joined = References(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(References)))
     return joined, np.concatenate(cut)
 
 

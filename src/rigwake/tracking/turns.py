@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigwake.cameras.base import CameraModel
+from rigwake.cameras.base import CameraModel, Mask
 from rigwake.errors import EstimationError, UsageError
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
@@ -24,7 +24,7 @@ _MIN_MATCHES = 12
 _MAX_GAP_S = 0.5
 
 
-def visual_turns(stream: CameraStream, *, frames: int = 300) -> Trajectory:
+def visual_turns(stream: CameraStream, *, frames: int = 200) -> Trajectory:
     """A trajectory whose rotations are the camera's turns, and whose positions are all zero.
 
     frames: at most so many, in a row, from the middle of the recording. It drifts by degrees, and points on the
@@ -38,7 +38,8 @@ def visual_turns(stream: CameraStream, *, frames: int = 300) -> Trajectory:
     count = min(frames, len(stream))
     start = (len(stream) - count) // 2
     usable = ~beyond_lens(stream.model)
-    stamps, rotations, segments = [], [np.eye(3)], [0]
+    stamps: list[int] = []
+    rotations, segments = [np.eye(3)], [0]
     before: Image | None = None
     for frame in stream.frames(np.arange(start, start + count)):
         if before is not None:
@@ -62,7 +63,7 @@ def visual_turns(stream: CameraStream, *, frames: int = 300) -> Trajectory:
     )
 
 
-def _turn(before: Image, after: Image, model: CameraModel, usable: Array) -> Array | None:
+def _turn(before: Image, after: Image, model: CameraModel, usable: Mask) -> Array | None:
     """Rotation `after_from_before` (3, 3) that most corners agree on; None with too few of them."""
     corners = detect_corners(
         before,
