@@ -153,7 +153,8 @@ def _imu(
     gyro, accel = path.imu(t)
     gyro = gyro + gyro_bias + rng.normal(0, GYRO_NOISE * 10, gyro.shape)
     accel = accel + accel_bias + rng.normal(0, ACCEL_NOISE * 10, accel.shape)
-    # the biases do not wander here: a walk of this size stays below what the solver allows for
+    gyro += np.cumsum(rng.normal(0, GYRO_WALK * 0.1, gyro.shape), axis=0)
+    accel += np.cumsum(rng.normal(0, ACCEL_WALK * 0.1, accel.shape), axis=0)
     return ImuStream("imu", stamps(t), gyro, accel, "", "", GYRO_NOISE, ACCEL_NOISE, GYRO_WALK, ACCEL_WALK)
 
 
@@ -189,6 +190,44 @@ def _observe(
     integers = table[:, :3].astype(np.int64)
     pixels = table[:, 3:].astype(np.float64)
     noisy = pixels + rng.normal(0, wanted.noise_px, pixels.shape) if wanted.noise_px else pixels
-    # a rolling shutter's row is where the point was seen
     std = np.full(len(noisy), wanted.noise_px or 1.0)
     return Observations(integers[:, 0], integers[:, 1], integers[:, 2], noisy, std)
+
+
+def free_cameras(problem: RigProblem, *parameters: str) -> RigProblem:
+    """The same problem with these parameters of every camera free."""
+    cameras = tuple(replace(camera, free=frozenset(parameters)) for camera in problem.cameras)
+    return replace(problem, cameras=cameras)
+
+
+def started_off(
+    problem: RigProblem, seed: int, rotation: float = 0.035, translation: float = 0.05
+) -> RigProblem:
+    """The problem with its free values off: extrinsics by 2 degrees and 5 cm, time offsets forgotten, states by
+    half a degree and 10 cm, landmarks by a tenth of their range."""
+    rng = np.random.default_rng(1000 + seed)
+    cameras = []
+    for camera in problem.cameras:
+        if "rig_from_cam" in camera.free:
+            off = np.concatenate([rng.normal(0, rotation, 3), rng.normal(0, translation, 3)])
+            camera = replace(camera, rig_from_cam=camera.rig_from_cam.retract(off))
+        if "time_offset" in camera.free:
+            camera = replace(camera, time_offset_s=0.0)
+        if "line_delay" in camera.free:
+            camera = replace(camera, line_delay_s=0.0)
+        cameras.append(camera)
+    n = len(problem.states)
+    off = np.concatenate([rng.normal(0, 0.01, (n, 3)), rng.normal(0, 0.1, (n, 3))], axis=1)
+    if problem.states.fixed is not None:
+        off[problem.states.fixed] = 0.0
+    states = replace(problem.states, world_from_rig=problem.states.world_from_rig.retract(off))
+    if states.inertial is not None:
+        zeros = np.zeros((n, 3))
+        velocity = states.inertial.velocity_world + rng.normal(0, 0.2, (n, 3))
+        states = replace(states, inertial=InertialStates(velocity, zeros, zeros))
+    marks = replace(
+        problem.landmarks,
+        inverse_ranges=problem.landmarks.inverse_ranges
+        * (1 + rng.uniform(-0.1, 0.1, len(problem.landmarks))),
+    )
+    return replace(problem, cameras=tuple(cameras), states=states, landmarks=marks)

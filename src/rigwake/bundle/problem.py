@@ -321,8 +321,9 @@ class SolverOptions:
 class SolverReport:
     """How the minimisation went: costs are half the sum of (robust) squared whitened residuals.
 
-    reason: why it stopped. invalid_observations: those whose landmark lies outside the lens model's reach at
-    the optimum. notes: what was left out or widened on the way (fixes out of range, IMU gaps).
+    reason: why it stopped. beyond_lens: observations whose landmark lies beyond the lens model's reach at the
+    optimum (compared with their own ray; left out where the observed pixel has none). notes: what was left
+    out on the way (fixes out of range).
     """
 
     converged: bool
@@ -331,7 +332,7 @@ class SolverReport:
     initial_cost: float
     final_cost: float
     observations: int
-    invalid_observations: int
+    beyond_lens: int
     notes: tuple[str, ...] = ()
 
 
@@ -340,7 +341,7 @@ class RigSolution:
     """The problem at its optimum.
 
     residuals_px: (M, 2) predicted minus observed pixels in the order of `problem.observations`; NaN where the
-    landmark cannot be projected.
+    lens has no ray for the observed pixel, which then has no say.
     """
 
     problem: RigProblem

@@ -16,25 +16,23 @@ from rigwake.bundle.frames import Frames
 from rigwake.bundle.layout import Layout, tangent_bases
 from rigwake.bundle.motion import TimedPoses
 from rigwake.bundle.problem import BundleCamera, Indices, Mask, RigProblem, SolverOptions
+from rigwake.bundle.rim import extrapolated
 from rigwake.bundle.robust import robust
 from rigwake.bundle.schur import LinearObservations
 from rigwake.cameras.base import Projection
 from rigwake.geometry import so3
 from rigwake.geometry.so3 import Array
 
-_UNSEEN_SIGMAS = (
-    100.0  # what an observation costs whose landmark the lens cannot see: a step that loses it fails
-)
-
 
 @dataclass(frozen=True, eq=False)
 class Reprojection:
-    """Residuals (M, 2) in pixels, in the order of `Frames.order`, NaN where the lens cannot see the landmark
-    (`valid`, (M,)), and their robust cost."""
+    """Residuals (M, 2) in pixels, in the order of `Frames.order`, NaN where the lens has no ray for the observed
+    pixel (not `valid`, (M,)), their robust cost, and how many landmarks lie beyond the lens (`rim.py`)."""
 
     residuals_px: Array
     valid: Mask
     cost: float
+    beyond: int
 
 
 def reproject(problem: RigProblem, frames: Frames, poses: TimedPoses, options: SolverOptions) -> Reprojection:
@@ -98,11 +96,13 @@ class _ReadOut:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """What one camera sees: its (sorted) observations `rows`, and where their landmarks project to."""
+    """What one camera sees: its (sorted) observations `rows`, where their landmarks project to, and how many
+    of these lie beyond the lens model."""
 
     rows: Indices
     read_out: _ReadOut | None
     projection: Projection
+    beyond: int
 
 
 def _directions_of(problem: RigProblem, frames: Frames, poses: TimedPoses) -> Array:
@@ -124,7 +124,7 @@ def _directions_of(problem: RigProblem, frames: Frames, poses: TimedPoses) -> Ar
 def _views(
     problem: RigProblem, frames: Frames, poses: TimedPoses, points: Array, derivatives: bool
 ) -> list[_View]:
-    views = []
+    views, observed = [], problem.observations.pixels[frames.order]
     for camera, rows in zip(problem.cameras, frames.observations, strict=True):
         y, read_out = points[rows], None
         if camera.line_delay_s != 0 or "line_delay" in camera.free:
@@ -134,7 +134,13 @@ def _views(
             projection = camera.model.project_with_jacobians(y)
         else:
             projection = Projection(*camera.model.project(y), np.empty((0, 2, 3)), np.empty((0, 2, 0)))
-        views.append(_View(rows, read_out, projection))
+        beyond = np.flatnonzero(~projection.valid)
+        if len(beyond):
+            near = extrapolated(camera.model, observed[rows[beyond]], y[beyond])
+            projection.pixels[beyond], projection.valid[beyond] = near.pixels, near.valid
+            if derivatives:
+                projection.d_point[beyond] = near.d_point
+        views.append(_View(rows, read_out, projection, len(beyond)))
     return views
 
 
@@ -147,9 +153,10 @@ def _compared(
     for view in views:
         predicted[view.rows], valid[view.rows] = view.projection.pixels, view.projection.valid
     residuals, weights = predicted - seen.pixels[frames.order], 1 / seen.std_px[frames.order]
-    squared = np.where(valid, np.sum((residuals * weights[:, None]) ** 2, axis=1), _UNSEEN_SIGMAS**2)
+    squared = np.where(valid, np.sum((residuals * weights[:, None]) ** 2, axis=1), 0.0)
     loss, slope = robust(squared, options.loss, options.loss_scale)
-    return Reprojection(residuals, valid, 0.5 * float(loss.sum())), np.where(
+    beyond = sum(view.beyond for view in views)
+    return Reprojection(residuals, valid, 0.5 * float(loss.sum()), beyond), np.where(
         valid, weights * np.sqrt(slope), 0.0
     )
 

@@ -145,7 +145,8 @@ def _minimise(problem: RigProblem, options: SolverOptions) -> RigSolution:
     for iteration in range(1, options.max_iterations + 1):  # noqa: B007
         trial = _trial(linear, structure, options, damping)
         if trial is None or trial.actual <= 0:
-            if trial is not None and trial.predicted <= options.tolerance * linear.cost:
+            unhindered = growth == 2.0  # the first step from here: not shortened because others failed
+            if trial is not None and unhindered and trial.predicted <= options.tolerance * linear.cost:
                 reason, converged = "no step lowers the cost further", True
                 break
             damping, growth = damping * growth, growth * 2
@@ -154,26 +155,23 @@ def _minimise(problem: RigProblem, options: SolverOptions) -> RigSolution:
                 break
             continue
         gain = trial.actual / trial.predicted
+        settled = trial.actual <= options.tolerance * linear.cost and growth == 2.0
         damping, growth = damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 2.0
-        small = trial.actual <= options.tolerance * linear.cost and gain > 0.25
         linear = linearised(trial.problem, structure, options)
-        if small:
+        if settled:
             reason, converged = "the cost has settled", True
             break
-    return _solution(
-        linear,
-        structure,
-        SolverReport(
-            converged,
-            reason,
-            iteration,
-            initial,
-            linear.cost,
-            len(problem.observations),
-            int(np.sum(~linear.reprojection.valid)),
-            out_of_range_notes(problem),
-        ),
+    report = SolverReport(
+        converged,
+        reason,
+        iteration,
+        initial,
+        linear.cost,
+        len(problem.observations),
+        linear.reprojection.beyond,
+        out_of_range_notes(problem),
     )
+    return _solution(linear, structure, report)
 
 
 @dataclass(frozen=True, eq=False)
