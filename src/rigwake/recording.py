@@ -158,3 +158,22 @@ class Recording:
                 remedy=f"It has: {', '.join(self.cameras) or 'none'}.",
             )
         return self.cameras[name]
+
+
+def static_transform(recording: Recording, parent: str, child: str) -> SE3 | None:
+    """`parent_from_child` along the chain of static transforms, in either direction; None if there is none.
+
+    The shortest chain is taken (breadth first).
+    """
+    steps: dict[str, list[tuple[str, SE3]]] = {}
+    for (above, below), above_from_below in recording.static_transforms.items():
+        steps.setdefault(above, []).append((below, above_from_below))
+        steps.setdefault(below, []).append((above, above_from_below.inverse()))
+    found = {parent: SE3.identity()}
+    waiting = [parent]
+    for frame in waiting:
+        for neighbour, frame_from_neighbour in steps.get(frame, []):
+            if neighbour not in found:
+                found[neighbour] = found[frame] * frame_from_neighbour
+                waiting.append(neighbour)
+    return found.get(child)

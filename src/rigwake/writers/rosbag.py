@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import lz4.frame
 import numpy as np
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
@@ -55,8 +56,16 @@ def write_rosbag1(
         writer = Rosbag1Writer(temporary)
         if compression != "none":
             writer.set_compression(_COMPRESSION[compression])
+        if compression == "lz4":
+            writer.compressor = _ros_lz4
         _write(writer, topics, "ros1")
     return findings
+
+
+def _ros_lz4(content: bytes) -> bytes:
+    """LZ4 as ROS reads it: its library knows neither linked blocks nor frames that state their size."""
+    packed = lz4.frame.compress(content, block_linked=False, content_checksum=True, store_size=False)
+    return bytes(packed)
 
 
 def write_rosbag2(
