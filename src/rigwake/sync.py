@@ -53,9 +53,10 @@ def estimate_time_offset(reference: Trajectory, member: Trajectory) -> TimeOffse
     """
     step = min(float(np.median(np.diff(t.timestamps_ns))) * 1e-9 for t in (reference, member))
     step = max(step, max(reference.duration_s, member.duration_s) / 200_000)  # bounds memory
-    a, b = (_resampled_speed(t, step) for t in (reference, member))
-    lags, score, shared = _normalised_correlation(a, b)
-    best = int(np.argmax(score))
+    (a, known_a), (b, known_b) = (_resampled_speed(t, step) for t in (reference, member))
+    lags, score, shared = _normalised_correlation(a, known_a, b, known_b)
+    # likelihood of independent samples: a high correlation counts by how long it holds
+    best = int(np.argmax(-shared * np.log1p(-(np.clip(score, 0.0, 1 - 1e-9) ** 2))))
     if not score[best] >= MIN_CORRELATION:
         raise UnobservableError(
             f"The angular speeds of {reference.name} and {member.name} do not match at any time offset "
@@ -73,15 +74,27 @@ def estimate_time_offset(reference: Trajectory, member: Trajectory) -> TimeOffse
     return TimeOffset(float(offset), float(score[best]), float(shared[best] * step))
 
 
-def _resampled_speed(trajectory: Trajectory, step_s: float) -> Array:
+def _resampled_speed(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:
+    """Angular speed on a grid from the first pose on, and 1 where it is known, 0 in gaps."""
     times, speed = angular_speed(trajectory)
     known = np.isfinite(speed)
     grid = np.arange(0.0, trajectory.duration_s + step_s / 2, step_s)
-    return np.asarray(np.interp(grid, times[known], speed[known]))
+    if known.sum() < 2:
+        return np.zeros_like(grid), np.zeros_like(grid)
+    # an odometry that lost and found itself jumps: unclipped, that would outweigh all true turning
+    speed = np.minimum(speed, 1.5 * np.percentile(speed[known], 90))
+    at = times[known]
+    after = np.clip(np.searchsorted(at, grid), 1, len(at) - 1)
+    spacing = at[after] - at[after - 1]
+    inside = spacing <= 3 * max(step_s, float(np.median(np.diff(times))))
+    return np.interp(grid, at, speed[known]), inside.astype(np.float64)
 
 
-def _normalised_correlation(a: Array, b: Array) -> tuple[NDArray[np.int64], Array, Array]:
-    """Pearson correlation of `a[i + lag]` with `b[i]` at every lag, -inf where they overlap too little."""
+def _normalised_correlation(
+    a: Array, known_a: Array, b: Array, known_b: Array
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Pearson correlation of `a[i + lag]` with `b[i]` at every lag, -inf where they overlap too little, and
+    how many samples they share there."""
     size = next_fast_len(len(a) + len(b) - 1, real=True)
     lags = np.arange(-(len(b) - 1), len(a), dtype=np.int64)
 
@@ -89,16 +102,19 @@ def _normalised_correlation(a: Array, b: Array) -> tuple[NDArray[np.int64], Arra
         full = irfft(rfft(x, size) * np.conj(rfft(y, size)), size)
         return np.asarray(full[lags])  # negative lags wrap around
 
-    a, b = a - a.mean(), b - b.mean()
-    ones_a, ones_b = np.ones_like(a), np.ones_like(b)
-    n = np.maximum(np.round(correlate(ones_a, ones_b)), 1.0)
-    sum_a, sum_b = correlate(a, ones_b), correlate(ones_a, b)
+    def centred(x: Array, known: Array) -> tuple[Array, float]:
+        x = (x - np.sum(x * known) / max(known.sum(), 1.0)) * known
+        return x, float(np.sum(x * x) / max(known.sum(), 1.0))
+
+    (a, variation_a), (b, variation_b) = centred(a, known_a), centred(b, known_b)
+    n = np.maximum(np.round(correlate(known_a, known_b)), 1.0)
+    sum_a, sum_b = correlate(a, known_b), correlate(known_a, b)
     covariance = correlate(a, b) - sum_a * sum_b / n
-    variance_a = correlate(a * a, ones_b) - sum_a**2 / n
-    variance_b = correlate(ones_a, b * b) - sum_b**2 / n
+    variance_a = correlate(a * a, known_b) - sum_a**2 / n
+    variance_b = correlate(known_a, b * b) - sum_b**2 / n
     # lags whose overlap holds hardly any variation correlate by rounding and chance
-    enough = n >= MIN_OVERLAP * min(len(a), len(b))
-    varied = (variance_a > 1e-2 * a.var() * n) & (variance_b > 1e-2 * b.var() * n) & (a.var() > 1e-12)
-    usable = enough & varied & (b.var() > 1e-12)
+    usable = n >= MIN_OVERLAP * min(known_a.sum(), known_b.sum())
+    for variance, variation in ((variance_a, variation_a), (variance_b, variation_b)):
+        usable &= (variance > 1e-2 * variation * n) & (variation > 1e-12)
     product = np.sqrt(np.where(usable, variance_a * variance_b, 1.0))
     return lags, np.where(usable, covariance / product, -np.inf), n
