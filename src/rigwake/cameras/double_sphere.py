@@ -26,10 +26,8 @@ def _project_point(
     w_q, w_z = 0.5 * xi / d1, xi * z / d1 + 1.0
     by_w = alpha * w / d2 + 1.0 - alpha
     by_q = 0.5 * alpha / d2 + by_w * w_q
-    scratch[0], scratch[1] = by_w * d1, d2 - w
-    quotient_to_pixel(
-        x, y, alpha * d2 + (1.0 - alpha) * w, by_q, by_w * w_z, scratch[:2], p, pixel, d_point, d_params
-    )
+    below = alpha * d2 + (1.0 - alpha) * w
+    quotient_to_pixel(x, y, below, by_q, by_w * w_z, by_w * d1, d2 - w, p, pixel, d_point, d_params)
 
 
 @register_jitable

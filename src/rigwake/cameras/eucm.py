@@ -23,8 +23,8 @@ def _project_point(
     d = sqrt(beta * q + z * z)
     below = alpha * d + (1.0 - alpha) * z
     by_q, by_z = 0.5 * alpha * beta / d, alpha * z / d + 1.0 - alpha
-    scratch[0], scratch[1] = d - z, 0.5 * alpha * q / d
-    quotient_to_pixel(x, y, below, by_q, by_z, scratch[:2], p, pixel, d_point, d_params)
+    by_alpha, by_beta = d - z, 0.5 * alpha * q / d
+    quotient_to_pixel(x, y, below, by_q, by_z, by_alpha, by_beta, p, pixel, d_point, d_params)
 
 
 @register_jitable

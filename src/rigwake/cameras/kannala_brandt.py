@@ -31,17 +31,15 @@ def _project_point(
 ) -> None:
     q = x * x + y * y
     n2 = q + z * z
-    if z > 0.0 and q < 1e-30 * n2:
-        scale_to_pixel(x, y, 1.0 / z, 0.0, -1.0 / (z * z), p, pixel, d_point, d_params)
-        d_params[:, 4:] = 0.0
-        return
-    rho = sqrt(q)
-    theta = atan2(rho, z)
-    radius, slope = odd_polynomial(p[4:], theta)
-    s, s_q, s_z = scale_slopes(radius, slope * z / n2, -slope * rho / n2, rho)
+    s, s_q, s_z, t2, power = 1.0 / z, 0.0, -1.0 / (z * z), 0.0, 0.0
+    if z <= 0.0 or q > 1e-30 * n2:  # else on the axis
+        rho = sqrt(q)
+        theta = atan2(rho, z)
+        radius, slope = odd_polynomial(p[4:], theta)
+        s, s_q, s_z = scale_slopes(radius, slope * z / n2, -slope * rho / n2, rho)
+        t2 = theta * theta
+        power = theta * t2 / rho
     scale_to_pixel(x, y, s, s_q, s_z, p, pixel, d_point, d_params)
-    t2 = theta * theta
-    power = theta * t2 / rho
     for i in range(4, len(p)):
         d_params[0, i], d_params[1, i] = p[0] * x * power, p[1] * y * power
         power *= t2

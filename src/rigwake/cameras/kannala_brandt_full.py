@@ -88,8 +88,8 @@ def _project_point(
     d_point[0, 0], d_point[0, 1] = mu * (x_t * t_x + x_phi * phi_x), mu * (x_t * t_y + x_phi * phi_y)
     d_point[1, 0], d_point[1, 1] = mv * (y_t * t_x + y_phi * phi_x), mv * (y_t * t_y + y_phi * phi_y)
     d_point[0, 2], d_point[1, 2] = mu * x_t * t_z, mv * y_t * t_z
-    d_params[:, :4] = 0.0
-    d_params[0, 0], d_params[1, 1], d_params[0, 2], d_params[1, 3] = mx, my, 1.0, 1.0
+    d_params[0, 0], d_params[0, 1], d_params[0, 2], d_params[0, 3] = mx, 0.0, 1.0, 0.0
+    d_params[1, 0], d_params[1, 1], d_params[1, 2], d_params[1, 3] = 0.0, my, 0.0, 1.0
     wave_i, wave_j = _wave(p[12:16], c, s)[0], _wave(p[19:23], c, s)[0]
     t2, power = theta * theta, theta
     for i in range(5):

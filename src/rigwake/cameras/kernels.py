@@ -134,10 +134,14 @@ def increasing_root(
         else:
             low = t
         following = t - (value - y) / slope
-        if not low <= following <= high:
+        if low <= following <= high:
+            # convergence is quadratic: the next step would be of the order of this one's square
+            if abs(following - t) <= 1e-9 * upper:
+                return following
+        else:
             following = 0.5 * (low + high)
-        if abs(following - t) <= 2e-16 * upper:
-            return following
+            if high - low <= 2e-16 * upper:
+                return following
         t = following
     return t
 
@@ -170,17 +174,17 @@ def scale_slopes(radius: float, by_rho: float, by_z: float, rho: float) -> tuple
 
 @register_jitable
 def quotient_to_pixel(
-    x: float, y: float, below: float, by_q: float, by_z: float, by_params: Array, params: Array,
-    pixel: Array, d_point: Array, d_params: Array,
+    x: float, y: float, below: float, by_q: float, by_z: float, by_first: float, by_second: float,
+    params: Array, pixel: Array, d_point: Array, d_params: Array,
 ) -> None:  # fmt: skip
     """As `scale_to_pixel` for `s = 1 / below`, from the derivatives of `below` by `x^2 + y^2`, by z, and by
-    the parameters after the first four."""
+    the two parameters after the first four."""
     s = 1.0 / below
     s2 = s * s
     scale_to_pixel(x, y, s, -s2 * by_q, -s2 * by_z, params, pixel, d_point, d_params)
-    for i in range(len(by_params)):
-        d_params[0, 4 + i] = -s2 * by_params[i] * params[0] * x
-        d_params[1, 4 + i] = -s2 * by_params[i] * params[1] * y
+    to_u, to_v = -s2 * params[0] * x, -s2 * params[1] * y
+    d_params[0, 4], d_params[0, 5] = to_u * by_first, to_u * by_second
+    d_params[1, 4], d_params[1, 5] = to_v * by_first, to_v * by_second
 
 
 @register_jitable

@@ -32,9 +32,8 @@ def _project_point(
     ux, uy, vx, vy = fx * a + skew * b, fx * b + skew * c, fy * b, fy * c
     d_point[0, 0], d_point[0, 1], d_point[0, 2] = ux / Z, uy / Z, -(ux * x + uy * y) / Z
     d_point[1, 0], d_point[1, 1], d_point[1, 2] = vx / Z, vy / Z, -(vx * x + vy * y) / Z
-    d_params[:, :5] = 0.0
-    d_params[0, 0], d_params[1, 1] = xd, yd
-    d_params[0, 2], d_params[1, 3], d_params[0, 4] = 1.0, 1.0, yd
+    d_params[0, 0], d_params[0, 1], d_params[0, 2], d_params[0, 3], d_params[0, 4] = xd, 0.0, 1.0, 0.0, yd
+    d_params[1, 0], d_params[1, 1], d_params[1, 2], d_params[1, 3], d_params[1, 4] = 0.0, yd, 0.0, 1.0, 0.0
     distortion_derivatives(x, y, p[5:], fx, fy, skew, d_params[:, 5:])
 
 
