@@ -99,7 +99,7 @@ class Tracks:
 def load_tracks(path: Path) -> Tracks:
     """Read what `Tracks.save` wrote; nothing in the file is executed. Raises InputError."""
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             report = str(arrays["report"])
             return Tracks(
                 str(arrays["camera"]),

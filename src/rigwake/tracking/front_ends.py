@@ -16,7 +16,7 @@ from rigwake.geometry.so3 import Array
 from rigwake.recording import CameraStream, Image
 from rigwake.tracking.descriptor_front_end import DescriptorFrontEnd
 from rigwake.tracking.klt_front_end import KltFrontEnd, Observed
-from rigwake.tracking.masks import CameraMask, beyond_lens
+from rigwake.tracking.masks import CameraMask, lens_mask, shrunk
 from rigwake.tracking.options import TrackingOptions
 from rigwake.tracking.water import HorizonMask
 from rigwake.tracks import TrackingReport, Tracks
@@ -36,7 +36,8 @@ def track_camera(
     """Follow points through the images of one camera.
 
     stream: must have a model, which turns pixels into bearings and predicts how patches deform.
-    mask: regions without static scene points; what lies beyond the lens is always left out.
+    mask: regions without static scene points (`lens_mask`, `find_hull`, `mask_from_file`); what the lens does not
+        show is left out in any case.
     indices: which frames of the stream to use (all by default). progress: told the number of frames done.
     The same input gives the same tracks. Raises UsageError if the camera has no model.
     """
@@ -47,7 +48,7 @@ def track_camera(
             consequence="Pixels cannot be turned into bearings.",
             remedy="Give a model for it, or calibrate one with `rigwake intrinsics`.",
         )
-    usable = _static_region(stream.model, options, mask)
+    usable = _static_region(stream, options, mask)
     chosen = np.arange(len(stream)) if indices is None else np.asarray(indices)
     front_end = _front_end(stream.model, options)
     last_ns: int | None = None
@@ -85,11 +86,13 @@ def _front_end(model: CameraModel, options: TrackingOptions) -> FrontEnd:
     return KltFrontEnd(model, options) if options.front_end == "klt" else DescriptorFrontEnd(options)
 
 
-def _static_region(model: CameraModel, options: TrackingOptions, mask: CameraMask | None) -> Mask:
+def _static_region(stream: CameraStream, options: TrackingOptions, mask: CameraMask | None) -> Mask:
     """Where points may be in every frame."""
-    usable = ~beyond_lens(model)
+    usable = lens_mask(stream).usable if mask is None or "lens" not in mask.excluded else mask.usable
     if mask is not None:
         usable &= mask.usable
+    # a patch that reaches over the edge of the lens or the hull would hold on to it
+    usable = shrunk(usable, options.patch_radius_px)
     if options.region_of_interest is not None:
         x, y, width, height = options.region_of_interest
         within = np.zeros_like(usable)

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from rigwake.cameras.base import Mask
 from rigwake.errors import EstimationError, UnobservableError
 from rigwake.recording import CameraStream
+from rigwake.tracking.masks import shrunk
 
 _STEADY_SHARE = 0.6  # of the gradient's power over time; random directions give 1 / frames
 _MIN_GRADIENT = 1.5  # grey levels per px, of the mean over time: far above what noise leaves
 _CLOSE_SHARE = 0.015  # gaps of an outline up to this share of the image height are closed
 _SMALL_SHARE = 3e-4  # of the image: smaller regions are not hull
-_ISLAND_SHARE = 5e-3  # of the image: smaller gaps inside the hull belong to it
+_ISLAND_SHARE = 1e-2  # of the image: smaller gaps inside the hull belong to it
 _MAX_SHARE = 0.6  # of the textured part of the image that may stand still
 _BORDER_PX = 6  # the edge of the image circle stands still, too
 
@@ -32,7 +33,7 @@ def find_hull(stream: CameraStream, usable: Mask, *, frames: int = 60, margin_px
     UnobservableError if most of the image stands still: then the boat did not turn, and all would be hull.
     """
     steady, textured = _steady_edges(stream, frames)
-    inner = _shrunk(usable, _BORDER_PX)
+    inner = shrunk(usable, _BORDER_PX)
     textured &= inner
     if (steady & textured).sum() > _MAX_SHARE * textured.sum():
         raise UnobservableError(
@@ -87,12 +88,3 @@ def _steady_edges(stream: CameraStream, frames: int) -> tuple[Mask, Mask]:
     lasting = total_x**2 + total_y**2
     steady = (lasting > _STEADY_SHARE * power * count) & (lasting > (_MIN_GRADIENT * count) ** 2)
     return np.asarray(steady), np.asarray(power > _MIN_GRADIENT**2 * count)
-
-
-def _shrunk(region: Mask, by_px: int) -> Mask:
-    size = 2 * by_px + 1
-    padded = np.pad(
-        region.astype(np.uint8), by_px, constant_values=1
-    )  # the image's edge is no border of the lens
-    eroded = cv2.erode(padded, np.ones((size, size), np.uint8))
-    return np.asarray(eroded[by_px:-by_px, by_px:-by_px] > 0)

@@ -13,6 +13,9 @@ from rigwake.atomic import atomic_path
 from rigwake.cameras.base import CameraModel, Mask
 from rigwake.errors import InputError, UsageError
 from rigwake.geometry.so3 import Array
+from rigwake.recording import CameraStream
+
+_DARK = 12  # grey levels: what a lens leaves outside its image circle, with stray light and noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +85,31 @@ def beyond_lens(model: CameraModel, margin: float = np.deg2rad(1.0)) -> Mask:
     return np.asarray(~valid.reshape(model.height_px, model.width_px))
 
 
+def beyond_image_circle(stream: CameraStream, frames: int = 20) -> Mask:
+    """(H, W), True where a lens throws no light: what stays dark in all of the frames looked at and reaches the
+    edge of the image, widened by 1 % of the image height. Nothing if the whole image stays dark, as at night."""
+    indices = np.unique(np.linspace(0, max(len(stream) - 1, 0), frames).astype(np.int64))
+    brightest = np.zeros((stream.height_px, stream.width_px), np.uint8)
+    for frame in stream.frames(indices):
+        np.maximum(brightest, cv2.blur(frame.image, (3, 3)), out=brightest)
+    dark = brightest < _DARK
+    if dark.mean() > 0.7:
+        return np.zeros_like(dark)
+    _, labels = cv2.connectedComponents(dark.astype(np.uint8))
+    rim = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    outside = np.isin(labels, rim[rim > 0])
+    reach = 2 * max(stream.height_px // 100, 1) + 1
+    return np.asarray(cv2.dilate(outside.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0)
+
+
+def lens_mask(stream: CameraStream) -> CameraMask:
+    """What the lens of a camera does not show, from its model (if known) and from its images, as `lens`."""
+    region = beyond_image_circle(stream)
+    if stream.model is not None:
+        region |= beyond_lens(stream.model)
+    return CameraMask(stream.width_px, stream.height_px).with_region("lens", region)
+
+
 def inside(usable: Mask, pixels: Array) -> Mask:
     """Which pixels (N, 2) lie on the image and where `usable` is True: (N,)."""
     height, width = usable.shape
@@ -89,3 +117,11 @@ def inside(usable: Mask, pixels: Array) -> Mask:
     x, y = nearest[:, 0], nearest[:, 1]
     on_image = (x >= 0) & (y >= 0) & (x < width) & (y < height)
     return np.asarray(on_image & usable[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)])
+
+
+def shrunk(region: Mask, by_px: int) -> Mask:
+    """The region (H, W) without what lies within `by_px` of its outside; the edge of the image is no outside."""
+    size = 2 * by_px + 1
+    padded = np.pad(region.astype(np.uint8), by_px, constant_values=1)
+    eroded = cv2.erode(padded, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+    return np.asarray(eroded[by_px : by_px + region.shape[0], by_px : by_px + region.shape[1]] > 0)
