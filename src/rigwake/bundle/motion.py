@@ -59,9 +59,9 @@ class TimedPoses:
 
     def chain(self, layout: Layout) -> tuple[Array, Indices]:
         """All derivatives side by side (n, 6, q), and their columns (n, q)."""
-        n, width = len(self.states), self.by_states.shape[-1]
-        by_states = np.moveaxis(self.by_states, 1, 2).reshape(n, 6, -1)
-        columns = layout.state_columns(self.states, width).reshape(n, -1)
+        n, neighbours, _, width = self.by_states.shape
+        by_states = np.moveaxis(self.by_states, 1, 2).reshape(n, 6, neighbours * width)
+        columns = layout.state_columns(self.states, width).reshape(n, neighbours * width)
         return (
             np.concatenate([by_states, self.by_shared], axis=2),
             np.concatenate([columns, self.shared], axis=1),
