@@ -15,7 +15,7 @@ _STEADY_SHARE = 0.6  # of the gradient's power over time; random directions give
 _MIN_GRADIENT = 1.5  # grey levels per px, of the mean over time: far above what noise leaves
 _CLOSE_SHARE = 0.015  # gaps of an outline up to this share of the image height are closed
 _SMALL_SHARE = 3e-4  # of the image: smaller regions are not hull
-_ISLAND_SHARE = 1e-2  # of the image: smaller gaps inside the hull belong to it
+_ISLAND_SHARE = 2e-2  # of the image: smaller gaps inside the hull belong to it
 _MAX_SHARE = 0.6  # of the textured part of the image that may stand still
 _BORDER_PX = 6  # the edge of the image circle stands still, too
 
