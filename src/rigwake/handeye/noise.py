@@ -59,7 +59,7 @@ def known_noise(mountings: Sequence[SE3], reference: Array, members: Sequence[Ar
         total[:, block, block] += covariance + np.diag(FLOOR)
         both = np.trace(reference[:, :3, :3] + covariance[:, :3, :3], axis1=1, axis2=2) / 3
         arm = float(np.sum(mountings[m].translation ** 2))
-        total[:, range(6 * m + 3, 6 * m + 6), range(6 * m + 3, 6 * m + 6)] += (both**2 * arm / 4)[:, None]
+        total[:, range(6 * m + 3, 6 * m + 6), range(6 * m + 3, 6 * m + 6)] += (both**2 * arm / 8)[:, None]
     return StepNoise(total, of_reference)
 
 

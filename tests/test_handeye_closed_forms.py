@@ -1,0 +1,24 @@
+"""The classical closed forms are right without noise, so that comparing with them is fair."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geometry_strategies import transforms
+from rigwake.geometry.se3 import SE3
+from rigwake.handeye.closed_forms import CLOSED_FORMS
+from rigwake.handeye.seed import linear_handeye
+
+SOLVERS = {**CLOSED_FORMS, "seed": linear_handeye}
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@given(mounting=transforms(), seed=st.integers(0, 2**31))
+@settings(max_examples=15, deadline=None)
+def test_exact_without_noise(name, mounting, seed):
+    rng = np.random.default_rng(seed)
+    B = SE3.exp(rng.normal(size=(20, 6)) * np.repeat([0.5, 1.0], 3))
+    found = SOLVERS[name](mounting * B * mounting.inverse(), B)
+    size = max(1.0, float(np.linalg.norm(mounting.translation)))
+    assert np.abs(mounting.local(found)).max() < 1e-5 * size
