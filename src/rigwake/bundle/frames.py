@@ -38,11 +38,11 @@ class Frames:
 def frames_of(problem: RigProblem) -> Frames:
     """The problem's images and the order of its observations."""
     seen = problem.observations
-    keys = np.stack([seen.timestamps_ns, seen.camera_indices], axis=1)
-    unique, inverse = np.unique(keys, axis=0, return_inverse=True)
-    inverse = inverse.reshape(-1)
+    stamps_ns, instants = np.unique(seen.timestamps_ns, return_inverse=True)
+    n_cameras = max(len(problem.cameras), 1)
+    unique, inverse = np.unique(instants * n_cameras + seen.camera_indices, return_inverse=True)
     order = np.lexsort((inverse, seen.landmark_indices))
-    cameras, stamps = unique[:, 1], seconds_since_start(problem, unique[:, 0])
+    cameras, stamps = unique % n_cameras, seconds_since_start(problem, stamps_ns)[unique // n_cameras]
     offsets = np.array([camera.time_offset_s for camera in problem.cameras])
     of_observation = inverse[order]
     every_camera = range(len(problem.cameras))

@@ -35,18 +35,12 @@ class Reprojection:
     beyond: int
 
 
-def reproject(problem: RigProblem, frames: Frames, poses: TimedPoses, options: SolverOptions) -> Reprojection:
-    """Residuals and cost alone."""
-    views = _views(problem, frames, poses, _directions_of(problem, frames, poses), derivatives=False)
-    return _compared(problem, frames, views, options)[0]
-
-
 def linearise(
     problem: RigProblem, layout: Layout, frames: Frames, poses: TimedPoses, options: SolverOptions
 ) -> tuple[Reprojection, LinearObservations]:
     """Residuals, cost, and derivatives, whitened and weighted by the robust loss."""
     points = _directions_of(problem, frames, poses)
-    views = _views(problem, frames, poses, points, derivatives=True)
+    views = _views(problem, frames, poses, points)
     result, factor = _compared(problem, frames, views, options)
     m, width = len(frames.order), max((_extra_width(camera, layout) for camera in problem.cameras), default=0)
     by_point = np.zeros((m, 2, 3))
@@ -121,25 +115,19 @@ def _directions_of(problem: RigProblem, frames: Frames, poses: TimedPoses) -> Ar
     return points
 
 
-def _views(
-    problem: RigProblem, frames: Frames, poses: TimedPoses, points: Array, derivatives: bool
-) -> list[_View]:
+def _views(problem: RigProblem, frames: Frames, poses: TimedPoses, points: Array) -> list[_View]:
     views, observed = [], problem.observations.pixels[frames.order]
     for camera, rows in zip(problem.cameras, frames.observations, strict=True):
         y, read_out = points[rows], None
         if camera.line_delay_s != 0 or "line_delay" in camera.free:
             read_out = _read_out(problem, camera, frames, poses, rows, y)
             y = read_out.points
-        if derivatives:
-            projection = camera.model.project_with_jacobians(y)
-        else:
-            projection = Projection(*camera.model.project(y), np.empty((0, 2, 3)), np.empty((0, 2, 0)))
+        projection = camera.model.project_with_jacobians(y)
         beyond = np.flatnonzero(~projection.valid)
         if len(beyond):
             near = extrapolated(camera.model, observed[rows[beyond]], y[beyond])
             projection.pixels[beyond], projection.valid[beyond] = near.pixels, near.valid
-            if derivatives:
-                projection.d_point[beyond] = near.d_point
+            projection.d_point[beyond] = near.d_point
         views.append(_View(rows, read_out, projection, len(beyond)))
     return views
 

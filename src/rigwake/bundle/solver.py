@@ -21,7 +21,7 @@ from rigwake.bundle.layout import Layout, layout_of, retract, tangent_bases
 from rigwake.bundle.motion import TimedPoses
 from rigwake.bundle.normal import Factors, NormalEquations
 from rigwake.bundle.problem import Indices, RigProblem, RigSolution, SolverOptions, SolverReport
-from rigwake.bundle.reprojection import Reprojection, linearise, reproject
+from rigwake.bundle.reprojection import Reprojection, linearise
 from rigwake.bundle.schur import (
     FrameEquations,
     FramePairs,
@@ -100,13 +100,6 @@ def _other_factors(problem: RigProblem, layout: Layout, options: SolverOptions) 
         yield inertial_factors(problem, layout)
 
 
-def cost_of(problem: RigProblem, structure: Structure, options: SolverOptions) -> float:
-    """The cost alone."""
-    poses = frame_poses(problem, structure.layout, structure.frames)
-    others = sum(part.cost for part in _other_factors(problem, structure.layout, options))
-    return reproject(problem, structure.frames, poses, options).cost + others
-
-
 def equations_of(
     linear: Linearisation, structure: Structure, damping: float
 ) -> tuple[NormalEquations, FrameEquations]:
@@ -157,7 +150,7 @@ def _minimise(problem: RigProblem, options: SolverOptions) -> RigSolution:
         gain = trial.actual / trial.predicted
         settled = trial.actual <= options.tolerance * linear.cost and growth == 2.0
         damping, growth = damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 2.0
-        linear = linearised(trial.problem, structure, options)
+        linear = trial.linear
         if settled:
             reason, converged = "the cost has settled", True
             break
@@ -176,9 +169,9 @@ def _minimise(problem: RigProblem, options: SolverOptions) -> RigSolution:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A step's values, with the decrease of the cost that the linear model promised and the one that came."""
+    """A step's end, with the decrease of the cost that the linear model promised and the one that came."""
 
-    problem: RigProblem
+    linear: Linearisation
     predicted: float
     actual: float
 
@@ -197,9 +190,8 @@ def _trial(
     marks = landmark_steps(linear.observations, reduced, frame_step, step[layout.extras_start :])
     problem = linear.problem
     bases = tangent_bases(problem.landmarks.bearings_world)
-    moved = retract(problem, layout, step, marks, bases)
-    actual = linear.cost - cost_of(moved, structure, options)
-    return _Trial(moved, _promised(equations, reduced, step), actual)
+    moved = linearised(retract(problem, layout, step, marks, bases), structure, options)
+    return _Trial(moved, _promised(equations, reduced, step), linear.cost - moved.cost)
 
 
 def _promised(equations: NormalEquations, reduced: FrameEquations, step: Array) -> float:
