@@ -26,6 +26,7 @@ _PARALLEL = np.deg2rad(4.0)
 _POOR_FIT_PX = 3.0
 _FOCAL_TOLERANCE = 0.02
 _RANK_TOLERANCE = 1e-11
+_NULL_SHARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,8 @@ class IntrinsicCalibration:
     view_names: kept views. residuals_px: (N, 2) projected minus observed, corners (N): what was seen, with
     `used` false for dropped corners. sigma_px: standard deviation of a pixel coordinate, from the residuals.
     rms_px: root mean square distance of used corners. dropped_views: names and reasons.
-    max_observed_angle: radians off the axis of the farthest used corner.
+    max_observed_angle: radians off the axis of the farthest used corner. axis_focal_std_px: standard deviation
+    of the pixels per radian at the axis.
     """
 
     camera: CameraModel
@@ -52,6 +54,7 @@ class IntrinsicCalibration:
     rms_px: float
     dropped_views: tuple[tuple[str, str], ...]
     max_observed_angle: float
+    axis_focal_std_px: float
     converged: bool
 
     @property
@@ -183,8 +186,11 @@ def _summary(
     if 2 * used.sum() <= unknowns:
         raise EstimationError(f"{used.sum()} corners cannot determine {unknowns} unknowns.")
     variance = squares / (2 * used.sum() - unknowns)
-    information, _, _ = linearise(estimate, corners, free, None).reduced()
-    covariance, undetermined = _covariance(estimate.camera, information, free, variance)
+    information = _Information.of(linearise(estimate, corners, free, None).reduced()[0], variance)
+    block, lost = information.covariance()
+    covariance = np.zeros((len(free), len(free)))
+    covariance[np.ix_(free, free)] = block
+    focal_gradient = _axis_focal_gradient(estimate.camera, free, information.scale)
     names = estimate.camera.param_names
     moved = estimate.cam_from_board[corners.view_index]
     rays = np.einsum("nij,nj->ni", moved.rotation, corners.points_board) + moved.translation
@@ -193,7 +199,8 @@ def _summary(
         camera=estimate.camera,
         covariance=covariance,
         fixed=tuple(name for name, is_free in zip(names, free, strict=True) if not is_free),
-        undetermined=undetermined,
+        undetermined=tuple(np.array(names)[free][lost].tolist()),
+        axis_focal_std_px=information.std_along(focal_gradient),
         cam_from_board=estimate.cam_from_board,
         view_names=tuple(view.name for view in observations.views),
         corners=replace(corners, used=used),
@@ -206,38 +213,55 @@ def _summary(
     )
 
 
-def _covariance(
-    camera: CameraModel, information: Array, free: Mask, variance: float
-) -> tuple[Array, tuple[str, ...]]:
-    """Covariance of the parameters, and the names of those that the views do not determine: those with a
-    part in the null space of the information (relative to its diagonal)."""
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    eigenvalues, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    known = eigenvalues > _RANK_TOLERANCE
-    inverse = (vectors[:, known] / eigenvalues[known]) @ vectors[:, known].T
-    block = variance * inverse / np.outer(scale, scale)
-    lost = (vectors[:, ~known] ** 2).sum(axis=1) > 1e-3
-    block[lost, :] = 0.0
-    block[:, lost] = 0.0
-    block[lost, lost] = np.inf
-    covariance = np.zeros((len(free), len(free)))
-    covariance[np.ix_(free, free)] = block
-    return covariance, tuple(np.array(camera.param_names)[free][lost].tolist())
+@dataclass(frozen=True, eq=False)
+class _Information:
+    """Eigenvectors of the camera's information, scaled to unit diagonal; directions that the views do not
+    determine (its null space) are told apart."""
+
+    scale: Array
+    eigenvalues: Array
+    vectors: Array
+    variance: float
+
+    @classmethod
+    def of(cls, information: Array, variance: float) -> _Information:
+        scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+        return cls(scale, *np.linalg.eigh(information / np.outer(scale, scale)), variance)
+
+    @property
+    def known(self) -> Mask:
+        """(P,) which eigenvectors are determined."""
+        return np.asarray(self.eigenvalues > _RANK_TOLERANCE)
+
+    def covariance(self) -> tuple[Array, Mask]:
+        """Covariance with an infinite diagonal where a parameter reaches into the null space, and which."""
+        known = self.known
+        inverse = (self.vectors[:, known] / self.eigenvalues[known]) @ self.vectors[:, known].T
+        block = self.variance * inverse / np.outer(self.scale, self.scale)
+        lost = (self.vectors[:, ~known] ** 2).sum(axis=1) > _NULL_SHARE
+        block[lost, :] = 0.0
+        block[:, lost] = 0.0
+        block[lost, lost] = np.inf
+        return block, lost
+
+    def std_along(self, gradient: Array) -> float:
+        """Standard deviation of a function of the parameters; infinite if the null space moves it."""
+        along = (gradient / self.scale) @ self.vectors
+        if np.sum(along[~self.known] ** 2) > _NULL_SHARE * np.sum(along**2):
+            return float(np.inf)
+        return float(np.sqrt(self.variance * np.sum(along[self.known] ** 2 / self.eigenvalues[self.known])))
 
 
-def axis_focal_std_px(camera: CameraModel, covariance: Array) -> float:
-    """Standard deviation of `axis_focal_px`, by central differences along the parameters."""
-    gradient = np.zeros(len(covariance))
-    for i, std in enumerate(np.sqrt(np.diag(covariance))):
-        if not np.isfinite(std):
-            return np.inf
-        if std > 0:
-            step = np.zeros(len(covariance))
-            step[i] = 1e-3 * std
-            longer = axis_focal_px(camera.with_params(camera.params + step))
-            shorter = axis_focal_px(camera.with_params(camera.params - step))
-            gradient[i] = (longer - shorter) / (2 * step[i])
-    return float(np.sqrt(gradient @ covariance @ gradient))
+def _axis_focal_gradient(camera: CameraModel, free: Mask, scale: Array) -> Array:
+    """Derivative of `axis_focal_px` by the free parameters, by central differences."""
+    gradient = np.zeros(len(scale))
+    for k, index in enumerate(np.flatnonzero(free)):
+        step = np.zeros(len(free))
+        step[index] = 1e-2 / scale[k]  # moves no pixel by more than a hundredth
+        longer = axis_focal_px(camera.with_params(camera.params + step))
+        shorter = axis_focal_px(camera.with_params(camera.params - step))
+        gradient[k] = (longer - shorter) / (2 * step[index])
+    return gradient
 
 
 def _limited(camera: CameraModel, max_angle: float) -> CameraModel:
@@ -257,7 +281,7 @@ def _refuse_poor_fit(result: IntrinsicCalibration) -> None:
 
 def _refuse_unknown_focal(result: IntrinsicCalibration) -> None:
     focal = axis_focal_px(result.camera)
-    std = axis_focal_std_px(result.camera, result.covariance)
+    std = result.axis_focal_std_px
     if not std <= _FOCAL_TOLERANCE * focal:
         raise UnobservableError(
             f"The views do not determine the focal length: {focal:.0f} px, give or take {std:.0f} px.",
