@@ -64,8 +64,8 @@ def unit_quaternions(quaternions: Array) -> Array:
 def symmetric_psd(covariances: Array, fallback: float) -> Array:
     """Covariances (N, k, k) made symmetric; those that are zero, negative or not finite become
     `fallback * I`."""
-    sane = (np.abs(covariances) < LARGEST_VALUE).all(axis=(1, 2))
-    bounded = np.where(sane[:, None, None], covariances, 0.0)
+    sane = np.all(np.abs(covariances) < LARGEST_VALUE, axis=(1, 2), keepdims=True)
+    bounded = np.where(sane, covariances, 0.0)
     symmetric = (bounded + np.swapaxes(bounded, -1, -2)) / 2
-    unusable = np.linalg.eigvalsh(symmetric)[:, 0] <= 0
-    return np.where(unusable[:, None, None], fallback * np.eye(symmetric.shape[-1]), symmetric)
+    usable = np.linalg.eigvalsh(symmetric)[:, 0, None, None] > 0
+    return np.where(usable, symmetric, fallback * np.eye(symmetric.shape[-1]))
