@@ -48,9 +48,14 @@ class RigCovariance:
     state_covariances: Array | None = None
 
     @property
+    def determined(self) -> Mask:
+        """(k,) which columns of `directions` have information."""
+        return np.asarray(self.shares >= _LEAST_SHARE)
+
+    @property
     def undetermined(self) -> Array:
         """(u, k) unit directions, in the parameters' own units, that nothing in the problem determines."""
-        raw = (self.scale[:, None] * self.directions[:, self.shares < _LEAST_SHARE]).T
+        raw = (self.scale[:, None] * self.directions[:, ~self.determined]).T
         return np.asarray(raw / np.linalg.norm(raw, axis=1, keepdims=True))
 
     def of(self, rows: Array) -> tuple[Array, Mask]:
@@ -59,7 +64,7 @@ class RigCovariance:
         Rows and columns of undetermined quantities are NaN.
         """
         scaled = np.atleast_2d(rows) * self.scale
-        good = self.shares >= _LEAST_SHARE
+        good = self.determined
         components = scaled @ self.directions
         lost = np.linalg.norm(components[:, ~good], axis=1)
         determined = lost <= _TOUCHED * np.maximum(np.linalg.norm(components, axis=1), 1e-300)
@@ -125,7 +130,7 @@ def _of_states(found: RigCovariance, reduced: ReducedEquations) -> Array:
     n, d = layout.n_states, layout.state_dim
     blocks = _inverse_blocks(reduced.factor, d)
     response = reduced.factor.backward(reduced.half_border)
-    good = found.shares >= _LEAST_SHARE
+    good = found.determined
     spread = response @ (found.scale[:, None] * found.directions[:, good] / np.sqrt(found.shares[good]))
     spread = spread.reshape(n, d, -1)
     blocks += spread @ np.swapaxes(spread, 1, 2)

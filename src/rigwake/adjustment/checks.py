@@ -1,0 +1,145 @@
+"""Checks that residuals cannot make: halves of the recording against each other, landmarks handed over."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rigwake.adjustment.cross_camera import camera_from_world
+from rigwake.adjustment.values import AdjustmentOptions
+from rigwake.adjustment.verdicts import ReferenceFrame, calibrated_cameras
+from rigwake.bundle.covariance import covariance_of
+from rigwake.bundle.problem import (
+    InertialStates,
+    Observations,
+    RigProblem,
+    RigSolution,
+    SolverOptions,
+    States,
+)
+from rigwake.bundle.solver import solve
+from rigwake.calibration import Calibration
+from rigwake.errors import RigwakeError
+from rigwake.evaluate.calibrations import compare_calibrations
+
+
+def residual_statistics(solution: RigSolution) -> dict[str, dict[str, Any]]:
+    """Per camera: observations, landmarks, and root mean square and median length of the residuals, px."""
+    observations = solution.problem.observations
+    length = np.linalg.norm(solution.residuals_px, axis=1)
+    found = {}
+    for index, camera in enumerate(solution.problem.cameras):
+        rows = (observations.camera_indices == index) & np.isfinite(length)
+        found[camera.name] = {
+            "observations": int(rows.sum()),
+            "landmarks": len(np.unique(observations.landmark_indices[rows])),
+            "rms_px": float(np.sqrt(np.mean(length[rows] ** 2))) if rows.any() else None,
+            "median_px": float(np.median(length[rows])) if rows.any() else None,
+        }
+    return found
+
+
+def part_of(problem: RigProblem, first: int, last: int, min_observations: int) -> RigProblem:
+    """The problem of the states `first..last - 1` alone, with the landmarks that are seen often enough in them."""
+    states, seen = problem.states, problem.observations
+    inside = slice(first, last)
+    stamps = states.timestamps_ns[inside]
+    offsets = np.array([round(c.time_offset_s * 1e9) for c in problem.cameras])
+    at = seen.timestamps_ns + offsets[seen.camera_indices]
+    margin = int(np.median(np.diff(states.timestamps_ns)) // 2)
+    rows = (at >= stamps[0] - margin) & (at <= stamps[-1] + margin)
+    counts = np.bincount(seen.landmark_indices[rows], minlength=len(problem.landmarks))
+    kept = np.flatnonzero(counts >= min_observations)
+    rows &= counts[seen.landmark_indices] >= min_observations
+    part = seen.take(rows)
+    inertial = states.inertial
+    if inertial is not None:
+        inertial = InertialStates(*(getattr(inertial, name)[inside] for name in vars(inertial)))
+    return replace(
+        problem,
+        states=States(stamps, states.world_from_rig[inside], inertial),
+        landmarks=problem.landmarks.take(kept),
+        observations=Observations(
+            part.camera_indices,
+            part.timestamps_ns,
+            np.searchsorted(kept, part.landmark_indices).astype(np.int64),
+            part.pixels,
+            part.std_px,
+        ),
+    )
+
+
+def split_half(
+    problem: RigProblem, reference: ReferenceFrame, options: AdjustmentOptions
+) -> tuple[Calibration, Calibration] | str:
+    """The rig from either half of the recording alone; or, in words, why a half does not determine it."""
+    middle = len(problem.states) // 2
+    halves = []
+    for first, last in ((0, middle), (middle, len(problem.states))):
+        try:
+            part = part_of(problem, first, last, options.min_observations)
+            solution = solve(part, SolverOptions(tolerance=1e-5))
+            covariance = covariance_of(solution.problem)
+            halves.append(calibrated_cameras(solution, covariance, reference, {}, {}))
+        except RigwakeError as error:
+            return str(error)
+    return halves[0], halves[1]
+
+
+def split_half_summary(halves: tuple[Calibration, Calibration] | str) -> dict[str, Any]:
+    """For `Calibration.checks`: per camera how far the halves are apart, and in how many of their sigmas."""
+    if isinstance(halves, str):
+        return {"failed": halves}
+    return {
+        name: {
+            "rotation_deg": d.rotation_deg,
+            "translation_m": 1e-3 * d.translation_mm,
+            "sigmas": d.sigmas,
+        }
+        for name, d in compare_calibrations(*halves).items()
+        if name != halves[0].reference
+    }
+
+
+def hand_over_errors(solution: RigSolution, unused: Observations) -> dict[str, Any]:
+    """Landmarks predicted into images that were not used for them: distances in px, over all and by camera pair."""
+    problem = solution.problem
+    points = problem.landmarks.points_world[unused.landmark_indices]
+    distance = np.full(len(unused), np.nan)
+    for index, camera in enumerate(problem.cameras):
+        rows = np.flatnonzero(unused.camera_indices == index)
+        if len(rows):
+            cam_from_world = camera_from_world(problem, index, unused.timestamps_ns[rows])
+            predicted, _ = camera.model.project(cam_from_world * points[rows])
+            distance[rows] = np.linalg.norm(predicted - unused.pixels[rows], axis=1)
+    distance_known = np.isfinite(distance)
+    first = _first_camera(problem)
+    names = [camera.name for camera in problem.cameras]
+    pairs = {}
+    for a in range(len(names)):
+        for b in range(len(names)):
+            rows = (first[unused.landmark_indices] == a) & (unused.camera_indices == b) & distance_known
+            if rows.any():
+                pairs[f"{names[a]}->{names[b]}"] = _summary(distance[rows])
+    return {**_summary(distance[distance_known]), "by_pair": pairs}
+
+
+def _first_camera(problem: RigProblem) -> np.ndarray:
+    """(L,) the camera that saw each landmark first."""
+    seen = problem.observations
+    order = np.lexsort((seen.timestamps_ns, seen.landmark_indices))
+    starts = np.searchsorted(seen.landmark_indices[order], np.arange(len(problem.landmarks)))
+    return np.asarray(seen.camera_indices[order[np.minimum(starts, len(order) - 1)]])
+
+
+def _summary(distance: np.ndarray) -> Mapping[str, Any]:
+    if not len(distance):
+        return {"count": 0, "median_px": None, "rms_px": None}
+    return {
+        "count": len(distance),
+        "median_px": float(np.median(distance)),
+        "rms_px": float(np.sqrt(np.mean(distance**2))),
+    }

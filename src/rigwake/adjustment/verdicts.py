@@ -1,0 +1,165 @@
+"""From an adjusted rig to calibrated cameras: seen from the wanted reference, with doubt and verdicts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rigwake.bundle.covariance import RigCovariance
+from rigwake.bundle.problem import BundleCamera, RigSolution
+from rigwake.calibration import CalibratedCamera, Calibration
+from rigwake.errors import UsageError
+from rigwake.geometry import so3
+from rigwake.geometry.se3 import SE3
+from rigwake.geometry.so3 import Array
+from rigwake.handeye.observability import open_directions
+
+_OPEN_ROTATION, _OPEN_TRANSLATION = np.deg2rad(50.0), 10.0  # stands for "not at all" in a covariance
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceFrame:
+    """The frame that the cameras are reported in.
+
+    name: `imu`, `base_link` or a camera's. reference_from_rig: exact, for a frame known to sit on the rig; None
+    when the reference is one of the cameras, whose own uncertainty then counts.
+    """
+
+    name: str
+    reference_from_rig: SE3 | None
+
+
+def calibrated_cameras(
+    solution: RigSolution,
+    covariance: RigCovariance,
+    reference: ReferenceFrame,
+    statistics: Mapping[str, Mapping[str, Any]],
+    topics: Mapping[str, str],
+) -> Calibration:
+    """The rig as seen from the reference, with joint covariance, verdicts per axis, clocks and lever arm.
+
+    Directions that nothing determines, or only so badly that a figure is as good as none (over 5 deg or 1 m),
+    are marked; see `handeye.observability`.
+    """
+    cameras = {camera.name: camera for camera in solution.problem.cameras}
+    if reference.reference_from_rig is None and reference.name not in cameras:
+        raise UsageError(
+            f"There is no frame {reference.name!r} to refer to.",
+            remedy=f"Choose imu, base_link or one of: {', '.join(cameras)}.",
+        )
+    others = [name for name in cameras if name != reference.name]
+    mounted = {name: _seen_from(reference, cameras, name) for name in others}
+    rows = np.concatenate([_rows(covariance, reference, cameras, mounted, name) for name in others])
+    joint = _with_open_directions(covariance, rows)
+    turns = _turns(solution.problem.states.world_from_rig)
+    found: dict[str, CalibratedCamera] = {}
+    for index, name in enumerate(others):
+        block = joint[6 * index : 6 * index + 6, 6 * index : 6 * index + 6]
+        offset, offset_std = _clock(covariance, cameras[name])
+        found[name] = CalibratedCamera(
+            name=name,
+            rig_from_cam=mounted[name],
+            covariance=block,
+            undetermined=open_directions(reference.name, name, mounted[name], block, turns),
+            time_offset_s=offset,
+            time_offset_std_s=offset_std,
+            model=cameras[name].model,
+            topic=topics.get(name, ""),
+            statistics=statistics.get(name, {}),
+        )
+    if reference.name in cameras:
+        found = {reference.name: _the_reference_itself(cameras[reference.name], statistics, topics), **found}
+        joint = np.block([[np.zeros((6, 6)), np.zeros((6, len(joint)))], [np.zeros((len(joint), 6)), joint]])
+    antenna, antenna_covariance = _antenna(solution, covariance, reference)
+    return Calibration(reference.name, found, joint, antenna, antenna_covariance)
+
+
+def _the_reference_itself(
+    camera: BundleCamera, statistics: Mapping[str, Mapping[str, Any]], topics: Mapping[str, str]
+) -> CalibratedCamera:
+    return CalibratedCamera(
+        camera.name,
+        SE3.identity(),
+        np.zeros((6, 6)),
+        time_offset_s=0.0,
+        model=camera.model,
+        topic=topics.get(camera.name, ""),
+        statistics=statistics.get(camera.name, {}),
+    )
+
+
+def _seen_from(reference: ReferenceFrame, cameras: Mapping[str, BundleCamera], name: str) -> SE3:
+    if reference.reference_from_rig is not None:
+        return reference.reference_from_rig * cameras[name].rig_from_cam
+    return cameras[reference.name].rig_from_cam.inverse() * cameras[name].rig_from_cam
+
+
+def _free_rows(covariance: RigCovariance, camera: BundleCamera) -> Array:
+    """(6, k) rows that select the camera's right tangent; zero for a camera that is held."""
+    if "rig_from_cam" in camera.free:
+        return covariance.rows_of(camera.name, "rig_from_cam")
+    return np.zeros((6, len(covariance.scale)))
+
+
+def _rows(
+    covariance: RigCovariance,
+    reference: ReferenceFrame,
+    cameras: Mapping[str, BundleCamera],
+    mounted: Mapping[str, SE3],
+    name: str,
+) -> Array:
+    """(6, k) rows of the right tangent of `reference_from_cam`.
+
+    With a camera as reference, `X = X_ref^-1 X_cam` gives `d = d_cam - Ad(X^-1) d_ref`.
+    """
+    rows = _free_rows(covariance, cameras[name])
+    if reference.reference_from_rig is None:
+        rows = rows - mounted[name].inverse().adjoint() @ _free_rows(covariance, cameras[reference.name])
+    return rows
+
+
+def _with_open_directions(covariance: RigCovariance, rows: Array) -> Array:
+    """Covariance of `rows @ parameters` in which undetermined directions have a size as good as none."""
+    good = covariance.determined
+    half = (rows * covariance.scale) @ covariance.directions[:, good] / np.sqrt(covariance.shares[good])
+    joint = half @ half.T
+    lost = rows @ covariance.undetermined.T
+    if lost.shape[1]:
+        units = np.tile(np.repeat([_OPEN_ROTATION, _OPEN_TRANSLATION], 3), len(rows) // 6)
+        sizes = np.linalg.norm(lost / units[:, None], axis=0)
+        lost = lost[:, sizes > 1e-9 * max(float(sizes.max()), 1e-300)]
+        lost = lost / np.maximum(np.abs(lost / units[:, None]).max(axis=0), 1e-12)
+        joint = joint + lost @ lost.T
+    return np.asarray(joint)
+
+
+def _turns(world_from_rig: SE3) -> Array:
+    """(N - 1, 3) rotation vectors between neighbouring states."""
+    R = world_from_rig.rotation
+    return so3.log(np.swapaxes(R[:-1], 1, 2) @ R[1:])
+
+
+def _clock(covariance: RigCovariance, camera: BundleCamera) -> tuple[float | None, float | None]:
+    if "time_offset" not in camera.free:
+        return None, None
+    spread, known = covariance.parameter(camera.name, "time_offset")
+    if not known.all() or spread[0, 0] > 0.1**2:
+        return None, None
+    return camera.time_offset_s, float(np.sqrt(spread[0, 0]))
+
+
+def _antenna(
+    solution: RigSolution, covariance: RigCovariance, reference: ReferenceFrame
+) -> tuple[Array | None, Array | None]:
+    """The lever arm in the reference frame where it was estimated and is determined."""
+    antenna = solution.problem.antenna
+    if solution.problem.gnss is None or not antenna.free or reference.reference_from_rig is None:
+        return None, None
+    spread, known = covariance.parameter("antenna", "position_rig")
+    if not known.all() or np.diag(spread).max() > 1.0:
+        return None, None
+    R = reference.reference_from_rig.rotation
+    return reference.reference_from_rig * antenna.position_rig, np.asarray(R @ spread @ R.T)
