@@ -52,7 +52,7 @@ def _lucas_kanade(
         guess,
         winSize=(window_px, window_px),
         maxLevel=levels - 1,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01),
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 12, 0.03),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     return np.asarray(landed, dtype=np.float32), np.asarray(found[:, 0] > 0)

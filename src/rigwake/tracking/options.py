@@ -35,7 +35,7 @@ class TrackingOptions:
 
     front_end: FrontEndName = "klt"
     max_features: int = 400
-    redetect_below: float = 0.8
+    redetect_below: float = 0.7
     redetect_every: int = 5
     cell_px: int = 40
     min_distance_px: int = 6
