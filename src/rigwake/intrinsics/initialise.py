@@ -24,9 +24,9 @@ from rigwake.intrinsics.adjust import Corners, Estimate, adjust, residuals
 from rigwake.intrinsics.board_pose import board_pose
 from rigwake.intrinsics.observations import BoardObservations, BoardView
 
-_FOCAL_STEPS = 40
+_FOCAL_STEPS = 24
 _FOCAL_RANGE = (0.12, 4.0)  # times the longer image side: from a lens of 270 deg to a long telephoto
-_SWEEP_VIEWS = 30  # more views do not change which focal length wins
+_SWEEP_VIEWS = 12  # more views do not change which focal length wins
 
 
 @dataclass(frozen=True, eq=False)
