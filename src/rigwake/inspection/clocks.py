@@ -15,6 +15,8 @@ from rigwake.recording import GnssStream, ImuStream, Stamps
 SEARCH_S = 1.0
 _MIN_EXPLAINED = 0.5  # of the variance; below, the lag is chance
 _MIN_PAIRS = 20
+_STRETCH_S = 2.0
+_MIN_STRETCHES = 4
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,13 @@ class ClockOffset:
     why: str = ""
 
 
-def _refined(lags: Array, cost: Array, samples: int, sensor: str, total: float) -> ClockOffset:
-    """The minimum of a least-squares cost over lags, by a parabola; its standard deviation by the curvature."""
+def _refined(lags: Array, squares: Array, times: Array, sensor: str, total: float) -> ClockOffset:
+    """The lag of the least sum of squares, to a fraction of a step.
+
+    squares: (lags, samples) squared residuals; times: (samples,). The standard deviation is the larger of what
+    the curvature says and of the jackknife over stretches of time (neighbouring residuals share their causes).
+    """
+    cost = squares.sum(axis=1)
     best = int(np.argmin(cost))
     explained = 1 - float(cost[best]) / max(total, 1e-30)
     if explained < _MIN_EXPLAINED:
@@ -40,12 +47,24 @@ def _refined(lags: Array, cost: Array, samples: int, sensor: str, total: float) 
     if best in (0, len(lags) - 1):
         return ClockOffset(sensor, None, None, explained, f"the offset is beyond {abs(lags[best]):.1f} s")
     step = float(lags[1] - lags[0])
+    offset, curvature = _parabola(lags, cost)
+    std = step * float(np.sqrt(2 * cost[best] / max(squares.shape[1] - 4, 1) / curvature))
+    _, stretch = np.unique((times - times.min()) // _STRETCH_S, return_inverse=True)
+    parts = np.stack([squares[:, stretch == k].sum(axis=1) for k in range(stretch.max() + 1)])
+    if len(parts) >= _MIN_STRETCHES:
+        without = np.array([_parabola(lags, cost - part)[0] for part in parts])
+        spread = np.sum((without - without.mean()) ** 2) * (len(parts) - 1) / len(parts)
+        std = max(std, float(np.sqrt(spread)))
+    return ClockOffset(sensor, offset, std, explained)
+
+
+def _parabola(lags: Array, cost: Array) -> tuple[float, float]:
+    """Position of the minimum by a parabola through the lowest three, and its second difference."""
+    best = int(np.clip(np.argmin(cost), 1, len(lags) - 2))
     below, centre, above = (float(c) for c in cost[best - 1 : best + 2])
-    curvature = below - 2 * centre + above
-    shift = 0.5 * (below - above) / curvature if curvature > 0 else 0.0
-    variance = centre / max(samples - 4, 1)
-    std = step * float(np.sqrt(2 * variance / curvature)) if curvature > 0 else step
-    return ClockOffset(sensor, float(lags[best]) + shift * step, std, explained)
+    curvature = max(below - 2 * centre + above, 1e-30)
+    shift = float(np.clip(0.5 * (below - above) / curvature, -1, 1))
+    return float(lags[best]) + shift * float(lags[1] - lags[0]), curvature
 
 
 def _mean_rates(imu: ImuStream) -> Callable[[Array, Array], Array]:
@@ -77,11 +96,11 @@ def camera_offset(camera: str, pictures: Pictures, imu: ImuStream) -> ClockOffse
     weights = np.ones(len(measured))
     for _ in range(3):
         fits = [_rotation_residuals(measured, rates(start + lag, end + lag), weights) for lag in lags]
-        cost = np.array([np.sum(weights * np.sum(r**2, axis=1)) for r in fits])
-        best = np.linalg.norm(fits[int(np.argmin(cost))], axis=1)
+        squares = np.array([weights * np.sum(r**2, axis=1) for r in fits])
+        best = np.linalg.norm(fits[int(np.argmin(squares.sum(axis=1)))], axis=1)
         weights = 1 / (1 + (best / (2 * np.median(best) + 1e-12)) ** 2) ** 2
     total = float(np.sum(weights * np.sum(measured**2, axis=1)))
-    return _refined(lags, cost, 3 * int(inside.sum()), camera, total)
+    return _refined(lags, squares, start, camera, total)
 
 
 def _rotation_residuals(measured: Array, gyro: Array, weights: Array) -> Array:
@@ -114,17 +133,16 @@ def gnss_offset(gnss: GnssStream, imu: ImuStream) -> ClockOffset:
     step = max(float(np.median(np.diff(times))), 0.1)
     lags = np.arange(-SEARCH_S, SEARCH_S + 1e-9, 0.02)
     inertial = _InertialPath.of(imu)
-    cost, total, samples = np.zeros(len(lags)), 0.0, 0
+    squares, times_used, total = [], [], 0.0
     sections = min(max(int((last - first) / _SECTION_S), 1), _MAX_SECTIONS)
     for start in np.linspace(first, max(last - _SECTION_S, first), sections):
         at = np.arange(start, min(start + _SECTION_S, last), step)
         moved = _second_difference(lambda t: _interpolated(t, times, gnss.position_enu), at)
-        residuals = [_inertial_residual(moved, inertial, at + lag) for lag in lags]
-        cost += [r for r, _ in residuals]
-        total += residuals[int(np.argmin([r for r, _ in residuals]))][1]
-        samples += moved.size
-    # neighbouring second differences share most of their noise
-    return _refined(lags, cost, max(round(samples * step / (2 * _SPAN_S)), 5), gnss.name, total)
+        fits = [_inertial_residual(moved, inertial, at + lag) for lag in lags]
+        squares.append(np.array([left for left, _ in fits]))
+        total += fits[int(np.argmin(squares[-1].sum(axis=1)))][1]
+        times_used.append(at)
+    return _refined(lags, np.hstack(squares), np.concatenate(times_used), gnss.name, total)
 
 
 _SPAN_S = 0.5
@@ -163,8 +181,8 @@ def _second_difference(values_at: Callable[[Array], Array], at: Array) -> Array:
     return np.asarray(values_at(at + _SPAN_S) - 2 * values_at(at) + values_at(at - _SPAN_S))
 
 
-def _inertial_residual(moved: Array, inertial: _InertialPath, at: Array) -> tuple[float, float]:
-    """Sum of squared residuals of the linear fit at these times, and of the accelerations alone."""
+def _inertial_residual(moved: Array, inertial: _InertialPath, at: Array) -> tuple[Array, float]:
+    """Squared residual of the linear fit at each of these times, and the sum of squares of what it explains."""
     integrals = _second_difference(lambda t: _interpolated(t, inertial.times, inertial.integrals), at)
     lever = _second_difference(lambda t: _interpolated(t, inertial.times, inertial.rotations), at)
     accelerations, bias = integrals[:, :, 0], integrals[:, :, 1:]
@@ -175,7 +193,8 @@ def _inertial_residual(moved: Array, inertial: _InertialPath, at: Array) -> tupl
     rows = np.concatenate(columns, axis=2).reshape(3 * len(at), -1)
     target = (accelerations - np.stack([zero, zero, moved[:, 2]], axis=1)).ravel()
     solution = np.linalg.lstsq(rows, target, rcond=1e-6)[0]
-    return float(np.sum((target - rows @ solution) ** 2)), float(np.sum(target**2))
+    left = (target - rows @ solution).reshape(-1, 3)
+    return np.sum(left**2, axis=1), float(np.sum(target**2))
 
 
 def _slow_tilt(at: Array) -> Array:
