@@ -100,8 +100,8 @@ def test_mask_files_round_trip(tmp_path):
     region[10:, 5:9] = True
     mask = CameraMask(32, 24).with_region("hull", region)
     written = mask.save(tmp_path, "front")
-    assert sorted(p.name for p in written) == ["mask_front.png", "mask_front_hull.png"]
-    loaded = mask_from_file(tmp_path / "mask_front.png", 32, 24)
+    assert sorted(p.name for p in written) == ["front.png", "front_hull.png"]
+    loaded = mask_from_file(tmp_path / "front.png", 32, 24)
     np.testing.assert_array_equal(loaded.usable, ~region)
     assert list(loaded.excluded) == ["file"]
 

@@ -48,9 +48,9 @@ class CameraMask:
         return replace(self, excluded={**self.excluded, source: np.asarray(region, dtype=bool)})
 
     def save(self, folder: Path, camera: str) -> list[Path]:
-        """Write `mask_<camera>.png` (white: usable) and one `mask_<camera>_<source>.png` each (white: excluded)."""
-        images = {f"mask_{camera}": self.usable}
-        images |= {f"mask_{camera}_{source}": region for source, region in self.excluded.items()}
+        """Write `<camera>.png` (white: usable) and one `<camera>_<source>.png` each (white: excluded)."""
+        images = {camera: self.usable}
+        images |= {f"{camera}_{source}": region for source, region in self.excluded.items()}
         written = []
         for stem, region in images.items():
             path = folder / f"{stem}.png"
