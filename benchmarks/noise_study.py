@@ -233,13 +233,17 @@ def plot(rows: list[Row], path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=20)
-    parser.add_argument("--write", type=Path, help="folder for noise_study_table.md and noise_study.png")
+    parser.add_argument(
+        "--write", type=Path, help="folder of noise_study.md, whose table is renewed, and noise_study.png"
+    )
     arguments = parser.parse_args()
     rows = [study(kind, *level, arguments.draws) for kind in ("additive", "cumulative") for level in LEVELS]
     text = markdown(rows, arguments.draws)
     print(text)
     if arguments.write:
-        (arguments.write / "noise_study_table.md").write_text(text)
+        page = arguments.write / "noise_study.md"
+        before, _, after = page.read_text().partition("Worst translation axis")
+        page.write_text(before + text + "\n![" + after.partition("\n![")[2])
         plot(rows, arguments.write / "noise_study.png")
 
 

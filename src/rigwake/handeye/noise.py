@@ -167,6 +167,7 @@ class Jitter:
         return np.concatenate(parts, axis=1)
 
 
+_ENOUGH_STEPS = 20_000
 _THETAS = (0.0, 0.2, 0.4, 0.6, 0.7, 0.8, 0.86, 0.9, 0.93, 0.95, 0.965, 0.975, 0.98)
 
 
@@ -177,8 +178,10 @@ def _innovations(rows: Array, theta: float) -> Array:
 def fit_jitter(residuals: Array, valid: NDArray[np.bool_]) -> Jitter:
     """The filter with the smallest prediction errors (conditional least squares), per part of (N, 6).
 
-    Theta stays so far from 1 that the filter settles within a tenth of the data.
+    Theta stays so far from 1 that the filter settles within a tenth of the data. The first 20 000 steps are
+    enough to tell.
     """
+    residuals, valid = residuals[:_ENOUGH_STEPS], valid[:_ENOUGH_STEPS]
     thetas = [theta for theta in _THETAS if theta <= max(0.0, 1 - 10 / max(valid.sum(), 1))]
     best = []
     for rows in (residuals[:, :3], residuals[:, 3:]):
