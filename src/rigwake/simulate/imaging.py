@@ -12,15 +12,15 @@ from rigwake.recording import Image
 from rigwake.simulate.meshes import Floats
 from rigwake.simulate.scenario import ImageNoise
 
-_EXPOSURE = 1.25
-_WHITE = 4.0
+_EXPOSURE = 0.62
 _DRIFT_PERIOD_S = 23.0
 
 
 def tone_curve() -> Floats:
-    """Grey values of linear light 0..16 in 4096 even steps of its square root: extended Reinhard, then gamma 2.2."""
-    light = (np.arange(4096) / 4095 * 4.0) ** 2 * _EXPOSURE
-    display = light * (1 + light / _WHITE**2) / (1 + light)
+    """Grey values of linear light 0..16 in 4096 even steps of its square root: the filmic curve of Narkowicz (2015),
+    *ACES Filmic Tone Mapping Curve*, then gamma 2.2."""
+    x = (np.arange(4096) / 4095 * 4.0) ** 2 * _EXPOSURE
+    display = x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)
     return np.asarray(255 * np.clip(display, 0, 1) ** (1 / 2.2), np.float32)
 
 

@@ -55,7 +55,7 @@ def build_sky(weather: Weather, seed: int) -> Sky:
     towards = np.clip(ray @ sun, 0, 1)[..., None]
     glow = (0.35 * towards**8 + 0.9 * towards**120) * SUN_COLOUR
     clouds, shade = _clouds(rng, ray, weather.cloud_cover)
-    white = np.array([0.98, 0.97, 0.96]) * (0.62 + 0.5 * shade[..., None]) + 0.5 * glow
+    white = np.array([0.98, 0.98, 1.0]) * (0.5 + 0.75 * shade[..., None]) + 0.5 * glow
     cover = (clouds * np.clip(sine * 9, 0, 1)[:, None])[..., None]
     panorama = (blue + glow) * (1 - cover) + white * cover
     weight = sine[:, None, None] ** 0.5
@@ -84,7 +84,7 @@ def _clouds(rng: np.random.Generator, ray: Array, cover: float) -> tuple[Array, 
     blend = map_coordinates(layer + 0.22 * detail, cells, order=1, mode="grid-wrap")
     threshold = np.quantile(layer, 1 - cover)
     opacity = np.clip((blend - threshold) * 1.5, 0, 1)
-    thick = np.clip((blend - threshold) * 0.6, 0, 1)
+    thick = np.clip((blend - threshold) * 0.7, 0, 1)
     return opacity * opacity * (3 - 2 * opacity), 1 - 0.75 * thick
 
 
