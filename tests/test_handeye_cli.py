@@ -1,0 +1,73 @@
+"""`rigwake handeye` end to end: files in, json and calibration out, exit codes."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from handeye_scenes import PORT, planar, standstill, wavy
+from rigwake.calibration import load_calibration
+from rigwake.cli.main import main
+from rigwake.geometry.se3 import SE3
+
+TIMES = np.arange(200) * 0.1
+
+
+def write_tum(path: Path, poses: SE3, offset_s: float = 0.0) -> Path:
+    q = poses.quat_wxyz
+    rows = np.column_stack([TIMES + offset_s, poses.translation, q[:, 1:], q[:, 0]])
+    np.savetxt(path, rows, fmt="%.12f")
+    return path
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Runs the verb in this process: (exit code, standard output)."""
+
+    def call(*arguments) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["rigwake", "handeye", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return int(ended.value.code or 0), capsys.readouterr().out
+
+    return call
+
+
+def test_result_in_json_and_calibration(tmp_path, run):
+    rig = write_tum(tmp_path / "rig.tum", wavy(TIMES))
+    port = write_tum(tmp_path / "port.tum", wavy(TIMES) * PORT, offset_s=300.0)
+    code, printed = run(rig, port, "--json", tmp_path / "out.json", "-o", tmp_path / "calibration.yaml")
+    assert code == 0
+    assert "next:" in printed
+    content = json.loads((tmp_path / "out.json").read_text())
+    member = content["members"]["port"]
+    assert content["reference"] == "rig"
+    assert member["time_offset_s"] == pytest.approx(-300, abs=1e-6)
+    assert member["ref_from_member"]["translation_m"] == pytest.approx(PORT.translation, abs=1e-6)
+    assert abs(np.dot(member["ref_from_member"]["quat_wxyz"], PORT.quat_wxyz)) == pytest.approx(1)
+    assert member["unobservable"] == []
+    camera = load_calibration(tmp_path / "calibration.yaml").camera("port")
+    assert np.abs(PORT.local(camera.rig_from_cam)).max() < 1e-6
+
+
+def test_open_axis_is_null_and_named(tmp_path, run):
+    rig = write_tum(tmp_path / "rig.tum", planar(TIMES))
+    port = write_tum(tmp_path / "port.tum", planar(TIMES) * PORT)
+    code, printed = run(rig, port, "--json", "-", "--no-time-offset")
+    assert code == 0
+    member = json.loads(printed)["members"]["port"]
+    assert member["ref_from_member"]["translation_m"][2] is None
+    assert member["std"]["translation_m"][2] is None
+    assert None not in member["ref_from_member"]["translation_m"][:2]
+    assert member["time_offset_s"] is None
+    assert "offset along z of rig" in member["unobservable"][0]["words"]
+
+
+def test_exit_codes(tmp_path, run):
+    still = write_tum(tmp_path / "still.tum", standstill(TIMES))
+    other = write_tum(tmp_path / "other.tum", standstill(TIMES))
+    assert run(still, other)[0] == 3
+    assert run(still, other, "--noise", "loud")[0] == 2
+    assert run(still, tmp_path / "missing.tum")[0] == 1
