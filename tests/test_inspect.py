@@ -76,7 +76,7 @@ def test_levelled_rotations_keep_the_vertical_and_turn_as_the_boat_does() -> Non
 
 
 @given(offset_ms=st.integers(-400, 400), seed=st.integers(0, 2**20))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=5, deadline=None)
 def test_camera_clock_is_recovered_within_its_sigmas(offset_ms: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     imu = simulated_imu()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -90,38 +89,28 @@ def read_fix(name: str, channel: Channel) -> tuple[GnssStream, Findings]:
     return stream, tuple(findings)
 
 
-def _pose_and_covariance(message: Any, message_type: str) -> tuple[Any, Any, Any]:
-    """Position, quaternion and the 36 covariance entries (or None) of any stamped pose message."""
-    if message_type.endswith("TransformStamped"):
-        return message.transform.translation, message.transform.rotation, None
-    if message_type.endswith("PoseStamped"):
-        return message.pose.position, message.pose.orientation, None
-    return message.pose.pose.position, message.pose.pose.orientation, message.pose.covariance
-
-
-POSE_TYPES = frozenset(
-    {
-        "nav_msgs/msg/Odometry",
-        "geometry_msgs/msg/PoseStamped",
-        "geometry_msgs/msg/PoseWithCovarianceStamped",
-        "geometry_msgs/msg/TransformStamped",
-    }
-)
+# How many float64 a pose message ends in: position, quaternion xyzw[, covariance (36)[, twist and covariance (42)]]
+_POSE_NUMBERS = {
+    "nav_msgs/msg/Odometry": 85,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": 43,
+    "geometry_msgs/msg/PoseStamped": 7,
+    "geometry_msgs/msg/TransformStamped": 7,
+}
+POSE_TYPES = frozenset(_POSE_NUMBERS)
 
 
 def read_poses(name: str, channel: Channel) -> tuple[Trajectory, Findings]:
-    """A trajectory from a pose topic. Raises InputError if no pose can be read."""
-    stamped = stamped_rows(name, channel)
-    messages = dict(decode_all(channel))
-    kept = [at for at, row in enumerate(stamped.rows) if row in messages]
-    parts = [_pose_and_covariance(messages[stamped.rows[at]], channel.message_type) for at in kept]
-    position = np.array([(p.x, p.y, p.z) for p, _, _ in parts]).reshape(-1, 3)
-    quat_wxyz = np.array([(q.w, q.x, q.y, q.z) for _, q, _ in parts]).reshape(-1, 4)
-    trajectory, findings = pose_trajectory(name, stamped.timestamps_ns[kept], position, quat_wxyz)
-    if parts[0][2] is not None:
-        rows = np.searchsorted(stamped.timestamps_ns[kept], trajectory.timestamps_ns)
-        order = np.argsort(stamped.timestamps_ns[kept], kind="stable")
-        stated = np.array([c for _, _, c in parts]).reshape(-1, 6, 6)[order][rows]
+    """A trajectory from a pose topic, metric. Raises InputError if no pose can be read."""
+    payloads = list(channel.payloads.read(range(len(channel))))
+    stamped = stamped_rows(name, channel, payloads)
+    count = _POSE_NUMBERS[channel.message_type]
+    values = trailing_doubles([payloads[row] for row in stamped.rows], count, channel.encoding)
+    quat_wxyz = values[:, [6, 3, 4, 5]]
+    trajectory, findings = pose_trajectory(name, stamped.timestamps_ns, values[:, :3], quat_wxyz)
+    if count > 7:
+        order = np.argsort(stamped.timestamps_ns, kind="stable")
+        rows = order[np.searchsorted(stamped.timestamps_ns[order], trajectory.timestamps_ns)]
+        stated = values[rows, 7:43].reshape(-1, 6, 6)
         trajectory = replace(
             trajectory,
             covariances=tangent_covariances(stated, trajectory.world_from_body),
