@@ -15,7 +15,18 @@ from rigwake.cli.console import print_error
 from rigwake.errors import RigwakeError
 
 # one module per verb in this package, each with a function `command`; the order is that of --help
-VERBS: tuple[str, ...] = ("inspect", "handeye", "intrinsics", "evaluate", "diff", "export", "simulate")
+VERBS: tuple[str, ...] = (
+    "calibrate",
+    "inspect",
+    "odometry",
+    "handeye",
+    "intrinsics",
+    "evaluate",
+    "diff",
+    "export",
+    "report",
+    "simulate",
+)
 
 
 def _print_version(wanted: bool) -> None:

@@ -1,0 +1,236 @@
+"""`rigwake odometry REC`: the trajectory of one camera, or of each."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from pathlib import Path
+from queue import Empty
+from typing import TYPE_CHECKING, Annotated, Any, cast, get_args
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from rigwake.cli.console import next_step, out, progress_bar, write_json
+from rigwake.cli.topic_options import TopicOption, TopicsOption
+from rigwake.errors import RigwakeError, UsageError
+
+if TYPE_CHECKING:
+    from rigwake.odometry.camera import CameraOdometry, CameraOdometryOptions
+    from rigwake.recording import CameraStream, GnssStream, ImuStream, Recording
+
+
+def command(
+    recording: Annotated[
+        Path, typer.Argument(help="ROS bag, MCAP, EuRoC or KITTI folder, folder of images.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for NAME.tum, tracks and masks.")],
+    camera: Annotated[str, typer.Option(help="Name of a camera, or all.")] = "all",
+    front_end: Annotated[str, typer.Option(help="klt, sift, fast-brief or orb.")] = "klt",
+    method: Annotated[str, typer.Option(help="adjusted, or the frame-to-frame baseline: seed.")] = "adjusted",
+    imu: Annotated[bool, typer.Option("--imu/--no-imu", help="Use the recording's IMU.")] = True,
+    gnss: Annotated[bool, typer.Option("--gnss/--no-gnss", help="Use the recording's GNSS.")] = True,
+    hull: Annotated[bool, typer.Option("--hull/--no-hull", help="Look for the own boat in view.")] = True,
+    horizon: Annotated[
+        bool,
+        typer.Option("--horizon/--no-horizon", help="Leave out what lies below the horizon (with an IMU)."),
+    ] = True,
+    mask: Annotated[Path | None, typer.Option(help="Picture, white where the camera may be used.")] = None,
+    seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
+    topic: TopicOption = (),
+    topics: TopicsOption = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Counts, losses and speed ('-': print).")
+    ] = None,
+) -> None:
+    """Where a camera was, frame by frame: metric with an IMU or GNSS, up to scale without, and says so.
+
+    Example: [cyan]rigwake odometry harbour.bag --camera front -o OUT[/cyan]
+    """
+    from rigwake.odometry.camera import CameraOdometryOptions, Method
+    from rigwake.odometry.options import OdometryOptions
+    from rigwake.odometry.seed import SeedOptions
+    from rigwake.readers.open import open_recording
+    from rigwake.readers.topics import TopicMap
+    from rigwake.tracking.options import FrontEndName, TrackingOptions
+
+    _require("--front-end", front_end, get_args(FrontEndName))
+    _require("--method", method, get_args(Method))
+    opened = open_recording(recording, TopicMap.from_options(topic, topics))
+    options = CameraOdometryOptions(
+        method=cast(Method, method),
+        tracking=TrackingOptions(front_end=cast(FrontEndName, front_end)),
+        odometry=OdometryOptions(seed=seed),
+        seed=SeedOptions(seed=seed),
+        hull=hull,
+        horizon=horizon,
+        mask_file=mask,
+    )
+    streams = list(opened.cameras.values()) if camera == "all" else [opened.camera(camera)]
+    sensors = _first(opened.imus) if imu else None, _first(opened.gnss) if gnss else None
+    results = _run_all(streams, *sensors, options)
+    output.mkdir(parents=True, exist_ok=True)
+    for name, result in results.items():
+        if not isinstance(result, RigwakeError):
+            _write(output, name, result)
+    if json_file is not None:
+        write_json(json_file, _summary(opened, results))
+    failures = [r for r in results.values() if isinstance(r, RigwakeError)]
+    if str(json_file) != "-":
+        _print(results)
+    if len(failures) == len(results):
+        raise failures[0]
+    if str(json_file) != "-":
+        files = " ".join(
+            str(output / f"{n}.tum") for n, r in results.items() if not isinstance(r, RigwakeError)
+        )
+        next_step(f"rigwake handeye {files}", "a rig from these trajectories")
+
+
+def _require(option: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise UsageError(f"{option} {value!r} is unknown.", remedy=f"Choose from {', '.join(known)}.")
+
+
+def _first(streams: Any) -> Any:
+    return next(iter(streams.values()), None)
+
+
+Result = "CameraOdometry | RigwakeError"
+Report = Callable[[str, int, int], None]
+
+
+def _run_all(
+    streams: list[CameraStream],
+    imu: ImuStream | None,
+    gnss: GnssStream | None,
+    options: CameraOdometryOptions,
+) -> dict[str, CameraOdometry | RigwakeError]:
+    """Every camera in a process of its own, as many at a time as there are processors."""
+    workers = min(len(streams), multiprocessing.cpu_count())
+    with progress_bar() as bar:
+        tasks = {stream.name: bar.add_task(stream.name, total=1) for stream in streams}
+
+        def show(name: str, stage: str, done: int, total: int) -> None:
+            bar.update(tasks[name], description=f"{name}: {stage}", completed=done, total=total)
+
+        if len(streams) == 1:
+            only = streams[0]
+            return {only.name: _attempt(only, imu, gnss, options, lambda *state: show(only.name, *state))}
+        context = multiprocessing.get_context("spawn")
+        with context.Manager() as manager, ProcessPoolExecutor(workers, mp_context=context) as pool:
+            queue = manager.Queue()
+            futures = {s.name: pool.submit(_in_process, s, imu, gnss, options, queue) for s in streams}
+            while any(not future.done() for future in futures.values()):
+                _drain(queue, show)
+            return {name: _outcome(future) for name, future in futures.items()}
+
+
+def _drain(queue: Any, show: Callable[[str, str, int, int], None]) -> None:
+    try:
+        show(*queue.get(timeout=0.2))
+    except Empty:
+        return
+
+
+def _outcome(future: Future[tuple[CameraOdometry | None, tuple[str, str, str, int] | None]]) -> Any:
+    result, failure = future.result()
+    if failure is None:
+        return result
+    cause, consequence, remedy, exit_code = failure
+    error = RigwakeError(cause, consequence=consequence, remedy=remedy)
+    error.exit_code = exit_code  # type: ignore[misc]
+    return error
+
+
+def _in_process(
+    stream: CameraStream, imu: Any, gnss: Any, options: CameraOdometryOptions, queue: Any
+) -> tuple[CameraOdometry | None, tuple[str, str, str, int] | None]:
+    """One camera; an error travels between processes as its words, since exceptions pickle only their message."""
+    result = _attempt(stream, imu, gnss, options, lambda *state: queue.put((stream.name, *state)))
+    if isinstance(result, RigwakeError):
+        return None, (result.cause, result.consequence, result.remedy, result.exit_code)
+    return result, None
+
+
+def _attempt(
+    stream: CameraStream, imu: Any, gnss: Any, options: CameraOdometryOptions, report: Report
+) -> CameraOdometry | RigwakeError:
+    from rigwake.odometry.camera import run_camera
+
+    try:
+        return run_camera(stream, imu, gnss, options, report)
+    except RigwakeError as error:
+        return error
+
+
+def _write(output: Path, name: str, result: CameraOdometry) -> None:
+    from rigwake.writers.trajectories import write_tum
+
+    write_tum(result.trajectory, output / f"{name}.tum")
+    result.tracks.save(output / f"tracks_{name}.npz")
+    result.mask.save(output, name)
+
+
+def _summary(opened: Recording, results: dict[str, CameraOdometry | RigwakeError]) -> dict[str, Any]:
+    return {"recording": opened.path.name, "cameras": {n: _one_summary(r) for n, r in results.items()}}
+
+
+def _one_summary(result: CameraOdometry | RigwakeError) -> dict[str, Any]:
+    if isinstance(result, RigwakeError):
+        return {"error": str(result)}
+    frames = len(result.tracks.timestamps_ns)
+    total = sum(result.seconds.values())
+    summary: dict[str, Any] = {
+        "poses": len(result.trajectory),
+        "frames": frames,
+        "metric": result.trajectory.is_metric,
+        "scale_source": result.scale_source,
+        "path_length": result.trajectory.path_length,
+        "seconds": {stage: round(value, 3) for stage, value in result.seconds.items()},
+        "frames_per_second": frames / total if total > 0 else None,
+        "notes": list(result.notes),
+    }
+    if result.visual is not None:
+        summary["visual"] = dict(vars(result.visual.counts))
+    if result.smoothed is not None:
+        report = result.smoothed.solution.report
+        summary["smoother"] = {
+            "converged": report.converged,
+            "reason": report.reason,
+            "noise_factor": result.smoothed.noise_factor,
+            "frames_bridged": result.smoothed.bridged,
+            "time_offset_s": result.smoothed.time_offset_s,
+        }
+    return summary
+
+
+def _print(results: dict[str, CameraOdometry | RigwakeError]) -> None:
+    table = Table(
+        "camera", "frames placed", "segments", "lost", "bridged", "path", "scale", "frames/s", box=None
+    )
+    for name, result in results.items():
+        if isinstance(result, RigwakeError):
+            table.add_row(escape(name), "[red]failed[/red]", "", "", "", "", "", "")
+            continue
+        summary = _one_summary(result)
+        visual, smoother = summary.get("visual", {}), summary.get("smoother", {})
+        unit = "m" if result.trajectory.is_metric else "units"
+        scale = result.scale_source if result.trajectory.is_metric else "unknown: up to scale"
+        table.add_row(
+            escape(name),
+            f"{summary['poses']} of {summary['frames']}",
+            str(visual.get("segments", "-")),
+            str(visual.get("lost", "-")),
+            str(smoother.get("frames_bridged", "-")),
+            f"{summary['path_length']:.1f} {unit}",
+            scale,
+            f"{summary['frames_per_second'] or 0:.0f}",
+        )
+    out.print(table)
+    for name, result in results.items():
+        lines = [str(result)] if isinstance(result, RigwakeError) else list(result.notes)
+        for line in lines:
+            out.print(f"[yellow]{escape(name)}: {escape(line)}[/yellow]", soft_wrap=True)

@@ -1,0 +1,221 @@
+"""Everything that odometry does for one camera of a recording: masks, tracks, motion, metres."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from rigwake.errors import EstimationError, UnobservableError, UsageError
+from rigwake.geometry.so3 import Array
+from rigwake.odometry.gyro import GyroAlignment, align_gyro, camera_rotations, up_in_camera
+from rigwake.odometry.metric import MetricStart, metric_start
+from rigwake.odometry.monocular import estimate_monocular
+from rigwake.odometry.options import OdometryOptions
+from rigwake.odometry.result import OdometryResult
+from rigwake.odometry.seed import SeedOptions, estimate_seed
+from rigwake.odometry.smoother import SmoothedOdometry, smooth
+from rigwake.recording import CameraStream, GnssStream, ImuStream
+from rigwake.tracking.front_ends import track_camera
+from rigwake.tracking.hull import find_hull
+from rigwake.tracking.masks import CameraMask, lens_mask, mask_from_file
+from rigwake.tracking.options import TrackingOptions
+from rigwake.tracking.turns import visual_turns
+from rigwake.tracks import Tracks
+from rigwake.trajectory import Trajectory
+
+Progress = Callable[[str, int, int], None]
+Method = Literal["adjusted", "seed"]
+
+
+@dataclass(frozen=True)
+class CameraOdometryOptions:
+    """What to do for one camera.
+
+    method: `adjusted` (keyframes, bundle adjustment, smoother) or `seed` (the frame-to-frame baseline).
+    hull: look for the own boat in view. horizon: leave out what lies below the horizon (needs an IMU).
+    mask_file: picture of the camera's size, white where it may be used.
+    """
+
+    method: Method = "adjusted"
+    tracking: TrackingOptions = field(default_factory=TrackingOptions)
+    odometry: OdometryOptions = field(default_factory=OdometryOptions)
+    seed: SeedOptions = field(default_factory=SeedOptions)
+    hull: bool = True
+    horizon: bool = True
+    mask_file: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CameraOdometry:
+    """One camera's motion and how it came about.
+
+    trajectory: the result: metric where a sensor gave metres (`scale_source`), else up to scale.
+    visual, start, smoothed: the steps, None where they were not taken. notes: what was left out or bridged.
+    seconds: wall time by stage.
+    """
+
+    trajectory: Trajectory
+    scale_source: Literal["gnss", "imu", "none"]
+    tracks: Tracks
+    mask: CameraMask
+    visual: OdometryResult | None = None
+    start: MetricStart | None = None
+    smoothed: SmoothedOdometry | None = None
+    notes: tuple[str, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def run_camera(
+    stream: CameraStream,
+    imu: ImuStream | None = None,
+    gnss: GnssStream | None = None,
+    options: CameraOdometryOptions | None = None,
+    progress: Progress | None = None,
+) -> CameraOdometry:
+    """Masks, tracks, visual odometry and, with an IMU or GNSS, the metric smoother.
+
+    progress: told stage, done and total. Raises UsageError without intrinsics, EstimationError where the images do
+    not allow a start. Sensors that cannot tell the scale are named in the notes, and the result is up to scale.
+    """
+    options = options or CameraOdometryOptions()
+    if stream.model is None:
+        raise UsageError(
+            f"camera {stream.name} has no intrinsics.", remedy="Calibrate one with `rigwake intrinsics`."
+        )
+    run = _Run(stream, imu, gnss, options, progress or (lambda stage, done, total: None))
+    return run.seed() if options.method == "seed" else run.adjusted()
+
+
+class _Run:
+    """The stages of one run, with their times and notes."""
+
+    def __init__(
+        self,
+        stream: CameraStream,
+        imu: ImuStream | None,
+        gnss: GnssStream | None,
+        options: CameraOdometryOptions,
+        progress: Progress,
+    ) -> None:
+        assert stream.model is not None
+        self.stream, self.model = stream, stream.model
+        self.imu, self.gnss = imu, gnss
+        self.options = options
+        self.progress = progress
+        self.notes: list[str] = []
+        self.seconds: dict[str, float] = {}
+        self.stage_started = time.perf_counter()
+
+    def _done(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage], self.stage_started = now - self.stage_started, now
+
+    def _mask(self) -> CameraMask:
+        self.progress("masks", 0, 1)
+        mask = lens_mask(self.stream)
+        if self.options.mask_file is not None:
+            given = mask_from_file(self.options.mask_file, mask.width_px, mask.height_px)
+            mask = mask.with_region("file", ~given.usable)
+        if self.options.hull:
+            try:
+                mask = mask.with_region("hull", find_hull(self.stream, mask.usable))
+            except (UnobservableError, EstimationError) as error:
+                self.notes.append(f"own hull not looked for: {error.cause}")
+        self._done("masks")
+        return mask
+
+    def _gyro(self) -> GyroAlignment | None:
+        if self.imu is None:
+            return None
+        self.progress("aligning the gyroscope", 0, 1)
+        try:
+            return align_gyro(visual_turns(self.stream), self.imu)
+        except (UnobservableError, EstimationError) as error:
+            self.notes.append(f"tracking is not aided by the gyroscope: {error.cause}")
+            return None
+        finally:
+            self._done("gyroscope")
+
+    def _tracks(self, mask: CameraMask, gyro: GyroAlignment | None) -> Tracks:
+        up_cam: Array | None = None
+        if self.options.horizon and gyro is not None and self.imu is not None:
+            up_cam = up_in_camera(self.imu, gyro, self.stream.timestamps_ns)
+        total = len(self.stream)
+        tracks = track_camera(
+            self.stream,
+            self.options.tracking,
+            mask,
+            up_cam=up_cam,
+            progress=lambda done: self.progress("tracking", done, total),
+        )
+        self._done("tracking")
+        return tracks
+
+    def _measured(self) -> tuple[CameraMask, Tracks, Array | None]:
+        mask = self._mask()
+        gyro = self._gyro()
+        tracks = self._tracks(mask, gyro)
+        rotations = None
+        if gyro is not None and self.imu is not None:
+            rotations = camera_rotations(self.imu, gyro, tracks.timestamps_ns)
+        return mask, tracks, rotations
+
+    def seed(self) -> CameraOdometry:
+        """The baseline: frame to frame, no map."""
+        mask, tracks, rotations = self._measured()
+        trajectory = estimate_seed(tracks, self.model, self.options.seed, rotations=rotations)
+        self._done("odometry")
+        return CameraOdometry(trajectory, "none", tracks, mask, notes=tuple(self.notes), seconds=self.seconds)
+
+    def adjusted(self) -> CameraOdometry:
+        """Map, then metres."""
+        mask, tracks, rotations = self._measured()
+        total = len(tracks.timestamps_ns)
+        visual = estimate_monocular(
+            tracks,
+            self.model,
+            self.options.odometry,
+            rotations=rotations,
+            progress=lambda done: self.progress("odometry", min(done, total), total),
+        )
+        self._done("odometry")
+        start = self._start(visual)
+        smoothed = None
+        if start is not None:
+            self.progress("smoothing", 0, 1)
+            smoothed = smooth(tracks, self.model, visual, start, self.imu, self.gnss)
+            self._done("smoothing")
+        return CameraOdometry(
+            smoothed.trajectory if smoothed is not None else visual.trajectory,
+            start.scale_source if start is not None else "none",
+            tracks,
+            mask,
+            visual,
+            start,
+            smoothed,
+            tuple(self.notes),
+            self.seconds,
+        )
+
+    def _start(self, visual: OdometryResult) -> MetricStart | None:
+        if self.imu is None and self.gnss is None:
+            return None
+        try:
+            start = metric_start(visual.trajectory, self.imu, self.gnss)
+        except UnobservableError as error:
+            self.notes.append(f"up to scale: {error.cause}")
+            return None
+        self.notes += start.notes
+        return start
+
+
+def scene_share(mask: Array, tracks: Tracks) -> float:
+    """Share of a camera's observations that fall on `mask` (H, W), True where they should not be."""
+    at = np.rint(tracks.pixels).astype(np.int64)
+    inside = (at >= 0).all(axis=1) & (at[:, 0] < mask.shape[1]) & (at[:, 1] < mask.shape[0])
+    return float(mask[at[inside, 1], at[inside, 0]].mean()) if inside.any() else 0.0
