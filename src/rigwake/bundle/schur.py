@@ -44,10 +44,14 @@ class LinearObservations:
 @dataclass(frozen=True, eq=False)
 class FramePairs:
     """Which frames share landmarks, as rows of a lower triangle: frame f meets
-    `partners[row_starts[f]:row_starts[f + 1]]`, increasing, itself last."""
+    `partners[row_starts[f]:row_starts[f + 1]]`, increasing, itself last. Its observations are
+    `observations[observation_starts[f]:observation_starts[f + 1]]`, of the landmarks `landmarks` (M,)."""
 
     row_starts: Indices
     partners: Indices
+    observation_starts: Indices
+    observations: Indices
+    landmarks: Indices
 
     @property
     def rows(self) -> Indices:
@@ -86,7 +90,7 @@ def frame_pairs(landmark_starts: Indices, frames: Indices, n_frames: int) -> Fra
     row_starts = np.concatenate([[0], np.cumsum(counts)])
     partners = np.empty(row_starts[-1], dtype=np.int64)
     _count_or_list(landmark_starts, frames, starts, sorted_landmarks, row_starts[:-1].copy(), partners)
-    return FramePairs(row_starts, partners)
+    return FramePairs(row_starts, partners, starts, order, sorted_landmarks)
 
 
 @njit(cache=True)
@@ -132,8 +136,9 @@ def eliminate_landmarks(
         np.zeros((n_landmarks, 3)),
     )
     o, e = observations, equations
-    longest = int(np.diff(o.landmark_starts).max(initial=1))
-    _eliminate(
+    coupling, extras_coupling = np.empty((len(o.frames), 3, 6)), np.zeros((n_landmarks, n_extras, 3))
+    own = pairs.row_starts[1:] - 1
+    _sum_up(
         o.landmark_starts,
         o.frames,
         o.residuals,
@@ -141,10 +146,10 @@ def eliminate_landmarks(
         o.by_landmark,
         o.by_extras,
         o.extras,
-        pairs.row_starts,
-        pairs.partners,
+        own,
         damping,
-        longest,
+        coupling,
+        extras_coupling,
         e.blocks,
         e.gradient,
         e.diagonal,
@@ -155,6 +160,26 @@ def eliminate_landmarks(
         e.landmark_inverse,
         e.landmark_gradient,
     )
+    _subtract_landmarks(
+        o.landmark_starts,
+        o.frames,
+        pairs.row_starts,
+        pairs.partners,
+        pairs.observation_starts,
+        pairs.observations,
+        pairs.landmarks,
+        coupling,
+        extras_coupling,
+        e.landmark_inverse,
+        e.landmark_gradient,
+        e.blocks,
+        e.gradient,
+        e.with_extras,
+    )
+    if n_extras:
+        by_inverse = extras_coupling @ e.landmark_inverse
+        e.extras_gradient[:] -= np.einsum("lqi,li->q", by_inverse, e.landmark_gradient)
+        e.extras[:] -= np.tensordot(by_inverse, extras_coupling, axes=([0, 2], [0, 2]))
     return equations
 
 
@@ -178,7 +203,7 @@ def _invert_damped(V, damping, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _eliminate(  # type: ignore[no-untyped-def]
+def _sum_up(  # type: ignore[no-untyped-def]
     starts,
     frames,
     r,
@@ -186,10 +211,10 @@ def _eliminate(  # type: ignore[no-untyped-def]
     Jl,
     Je,
     extras,
-    row_starts,
-    partners,
+    own,
     damping,
-    longest,
+    coupling,
+    extras_coupling,
     blocks,
     gradient,
     diagonal,
@@ -200,20 +225,14 @@ def _eliminate(  # type: ignore[no-untyped-def]
     inverses,
     landmark_gradient,
 ):
-    n_extras, width = len(extras_gradient), extras.shape[1]
-    W, WV = np.empty((longest, 3, 6)), np.empty((6, 3))
-    V, We, WeV = np.empty((3, 3)), np.zeros((n_extras, 3)), np.zeros((n_extras, 3))
+    """`J^T J` and `-J^T r` of all observations, and the landmarks' inverse blocks."""
+    width, V = extras.shape[1], np.empty((3, 3))
     for landmark in range(len(starts) - 1):
-        begin, end = starts[landmark], starts[landmark + 1]
-        if begin == end:
-            continue
-        g = landmark_gradient[landmark]
+        g, We = landmark_gradient[landmark], extras_coupling[landmark]
         V[:] = 0.0
-        We[:] = 0.0
-        for m in range(begin, end):
+        for m in range(starts[landmark], starts[landmark + 1]):
             f = frames[m]
-            own = blocks[row_starts[f + 1] - 1]
-            Wm = W[m - begin]
+            block = blocks[own[f]]
             for i in range(3):
                 g[i] -= Jl[m, 0, i] * r[m, 0] + Jl[m, 1, i] * r[m, 1]
                 for j in range(3):
@@ -223,9 +242,9 @@ def _eliminate(  # type: ignore[no-untyped-def]
                 gradient[f, i] -= x * r[m, 0] + y * r[m, 1]
                 diagonal[f, i] += x * x + y * y
                 for j in range(6):
-                    own[i, j] += x * Jf[m, 0, j] + y * Jf[m, 1, j]
+                    block[i, j] += x * Jf[m, 0, j] + y * Jf[m, 1, j]
                 for j in range(3):
-                    Wm[j, i] = x * Jl[m, 0, j] + y * Jl[m, 1, j]
+                    coupling[m, j, i] = x * Jl[m, 0, j] + y * Jl[m, 1, j]
             for a in range(width):
                 q = extras[m, a]
                 if q < 0:
@@ -240,32 +259,53 @@ def _eliminate(  # type: ignore[no-untyped-def]
                 for b in range(width):
                     if extras[m, b] >= 0:
                         corner[q, extras[m, b]] += x * Je[m, 0, b] + y * Je[m, 1, b]
-        inverse = inverses[landmark]
-        _invert_damped(V, damping, inverse)
-        for q in range(n_extras):
-            for j in range(3):
-                WeV[q, j] = We[q, 0] * inverse[0, j] + We[q, 1] * inverse[1, j] + We[q, 2] * inverse[2, j]
-            extras_gradient[q] -= WeV[q, 0] * g[0] + WeV[q, 1] * g[1] + WeV[q, 2] * g[2]
-            for p in range(n_extras):
-                corner[q, p] -= WeV[q, 0] * We[p, 0] + WeV[q, 1] * We[p, 1] + WeV[q, 2] * We[p, 2]
-        for m in range(begin, end):
-            f = frames[m]
-            Wm = W[m - begin]
+        if starts[landmark + 1] > starts[landmark]:
+            _invert_damped(V, damping, inverses[landmark])
+
+
+@njit(cache=True)
+def _subtract_landmarks(  # type: ignore[no-untyped-def]
+    starts,
+    frames,
+    row_starts,
+    partners,
+    observation_starts,
+    observations,
+    landmarks,
+    coupling,
+    extras_coupling,
+    inverses,
+    landmark_gradient,
+    blocks,
+    gradient,
+    with_extras,
+):
+    """Subtract `W V^-1 W^T`, frame by frame, so that the blocks of a frame's row stay in the cache."""
+    WV, n_extras = np.empty((6, 3)), extras_coupling.shape[1]
+    for f in range(len(row_starts) - 1):
+        for slot in range(observation_starts[f], observation_starts[f + 1]):
+            m, landmark = observations[slot], landmarks[slot]
+            inverse, g, We = inverses[landmark], landmark_gradient[landmark], extras_coupling[landmark]
             for i in range(6):
                 for j in range(3):
-                    WV[i, j] = Wm[0, i] * inverse[0, j] + Wm[1, i] * inverse[1, j] + Wm[2, i] * inverse[2, j]
+                    total = 0.0
+                    for k in range(3):
+                        total += coupling[m, k, i] * inverse[k, j]
+                    WV[i, j] = total
                 gradient[f, i] -= WV[i, 0] * g[0] + WV[i, 1] * g[1] + WV[i, 2] * g[2]
                 for q in range(n_extras):
                     with_extras[f, i, q] -= WV[i, 0] * We[q, 0] + WV[i, 1] * We[q, 1] + WV[i, 2] * We[q, 2]
-            pair = row_starts[f] + np.searchsorted(partners[row_starts[f] : row_starts[f + 1]], frames[begin])
+            begin = starts[landmark]
+            row = partners[row_starts[f] : row_starts[f + 1]]
+            pair = np.searchsorted(row, frames[begin])
             for k in range(begin, m + 1):
-                while partners[pair] != frames[k]:
+                while row[pair] != frames[k]:
                     pair += 1
-                Wk, block = W[k - begin], blocks[pair]
+                W, block = coupling[k], blocks[row_starts[f] + pair]
                 for i in range(6):
                     x, y, z = WV[i, 0], WV[i, 1], WV[i, 2]
                     for j in range(6):
-                        block[i, j] -= x * Wk[0, j] + y * Wk[1, j] + z * Wk[2, j]
+                        block[i, j] -= x * W[0, j] + y * W[1, j] + z * W[2, j]
 
 
 def landmark_steps(
