@@ -1,1 +1,7 @@
-"""The report people read."""
+"""A report people can check: verdict, rig, doubt, residuals, pictures, in one HTML file."""
+
+from rigwake.report.content import ReportContent, load_report_content
+from rigwake.report.page import build_report
+from rigwake.report.summary import summary_lines
+
+__all__ = ["ReportContent", "build_report", "load_report_content", "summary_lines"]

@@ -1,0 +1,185 @@
+"""Charts as inline SVG: themed by the page's CSS, sharp in print, readable without scripts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup, escape
+
+from rigwake.geometry.so3 import Array
+from rigwake.report.reduce import ImageMap
+
+WIDTH, HEIGHT = 480.0, 210.0
+_LEFT, _RIGHT, _TOP, _BOTTOM = 54.0, 10.0, 10.0, 42.0
+COLOURS = 8
+"""Length of the palette; series beyond it differ by dashes as well."""
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """A line: x, y (N,), NaN breaks it; upper: the other edge of a band above the line; colour: of the palette."""
+
+    label: str
+    x: Array
+    y: Array
+    colour: int = 0
+    upper: Array | None = None
+
+
+def ticks(low: float, high: float, about: int = 5) -> list[float]:
+    """Round values inside an interval."""
+    span = high - low
+    if not np.isfinite(span) or span <= 0:
+        return [low]
+    raw = span / about
+    power = 10.0 ** np.floor(np.log10(raw))
+    step = float(min((m * power for m in (1, 2, 2.5, 5, 10)), key=lambda s: abs(s - raw)))
+    first = np.ceil(low / step - 1e-9)
+    return [float(k * step) + 0.0 for k in np.arange(first, np.floor(high / step + 1e-9) + 1)]
+
+
+def _label(value: float) -> str:
+    return f"{value + 0.0:.6g}".replace("-", "−")
+
+
+def line_chart(
+    title: str, x_label: str, y_label: str, series: Sequence[Series], from_zero: bool = True
+) -> Markup:
+    """Lines over a common axis; the title names the chart for those who cannot see it."""
+    drawn = [s for s in series if np.isfinite(s.y).any()]
+    if not drawn:
+        return Markup("")
+    x_low, x_high = _range([s.x for s in drawn])
+    y_low, y_high = _range([v for s in drawn for v in (s.y, s.upper) if v is not None])
+    y_low = min(0.0, y_low) if from_zero else y_low
+    pad = 0.06 * (y_high - y_low or 1.0)
+    y_high, y_low = y_high + pad, y_low if from_zero and y_low == 0 else y_low - pad
+    sx = (WIDTH - _LEFT - _RIGHT) / ((x_high - x_low) or 1.0)
+    sy = (HEIGHT - _TOP - _BOTTOM) / (y_high - y_low)
+
+    def at(x: Array, y: Array) -> list[str]:
+        u, v = _LEFT + (x - x_low) * sx, HEIGHT - _BOTTOM - (y - y_low) * sy
+        return [f"{a:.1f},{b:.1f}" for a, b in zip(u.tolist(), v.tolist(), strict=True)]
+
+    parts = []
+    for y in ticks(y_low, y_high):
+        v = HEIGHT - _BOTTOM - (y - y_low) * sy
+        parts.append(f'<path class="grid" d="M{_LEFT:.1f},{v:.1f}H{WIDTH - _RIGHT:.1f}"/>')
+        parts.append(
+            f'<text class="tick" x="{_LEFT - 6:.1f}" y="{v + 4:.1f}" text-anchor="end">{_label(y)}</text>'
+        )
+    for x in ticks(x_low, x_high, 8):
+        u = _LEFT + (x - x_low) * sx
+        parts.append(
+            f'<text class="tick" x="{u:.1f}" y="{HEIGHT - _BOTTOM + 16:.1f}" text-anchor="middle">{_label(x)}</text>'
+        )
+    for one in drawn:
+        parts += _line(one, at)
+    parts.append(
+        f'<text class="axis" x="{(WIDTH + _LEFT) / 2:.1f}" y="{HEIGHT - 6:.1f}" '
+        f'text-anchor="middle">{escape(x_label)}</text>'
+        f'<text class="axis" x="14" y="{HEIGHT / 2 - 10:.1f}" text-anchor="middle" '
+        f'transform="rotate(-90 14 {HEIGHT / 2 - 10:.1f})">{escape(y_label)}</text>'
+    )
+    return _svg(title, WIDTH, HEIGHT, parts, "chart")
+
+
+def _range(values: Sequence[Array]) -> tuple[float, float]:
+    finite = np.concatenate([v[np.isfinite(v)] for v in values])
+    return float(finite.min()), float(finite.max())
+
+
+def _line(series: Series, at) -> list[str]:  # type: ignore[no-untyped-def]
+    """The line, broken where there is no number, and its band."""
+    css = f"c{series.colour % COLOURS}{' dashed' if series.colour >= COLOURS else ''}"
+    known = np.isfinite(series.y) & np.isfinite(series.x)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
+    parts = []
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        x, y = series.x[start:end], series.y[start:end]
+        if series.upper is not None:
+            outline = at(x, series.upper[start:end]) + at(x, y)[::-1]
+            parts.append(f'<polygon class="band {css}" points="{" ".join(outline)}"/>')
+        points = at(x, y)
+        if len(points) == 1:
+            u, v = points[0].split(",")
+            parts.append(f'<circle class="dot {css}" cx="{u}" cy="{v}" r="2.5"/>')
+        else:
+            parts.append(f'<polyline class="line {css}" points="{" ".join(points)}"/>')
+    return parts
+
+
+def image_map(title: str, data: ImageMap, colour: int) -> Markup:
+    """Coverage as shaded cells, mean residuals as arrows whose scale is stated beside them."""
+    rows, columns = data.counts.shape
+    width, height = 300.0, 300.0 * data.height_px / data.width_px
+    du, dv = width / columns, height / rows
+    most = max(float(data.counts.max()), 1.0)
+    parts = [f'<rect class="frame" width="{width:.1f}" height="{height:.1f}"/>']
+    for r, c in zip(*np.nonzero(data.counts), strict=True):
+        share = np.sqrt(data.counts[r, c] / most)
+        parts.append(
+            f'<rect class="cell c{colour % COLOURS}" x="{c * du:.1f}" y="{r * dv:.1f}" width="{du:.2f}" '
+            f'height="{dv:.2f}" fill-opacity="{0.12 + 0.6 * share:.2f}"/>'
+        )
+    if data.mean_px is not None:
+        parts += _arrows(data.mean_px, du, dv)
+    return _svg(title, width, height, parts, "map")
+
+
+def arrow_scale(data: ImageMap) -> float:
+    """Pixels of residual that an arrow as long as a cell stands for."""
+    if data.mean_px is None:
+        return 0.0
+    size = np.linalg.norm(data.mean_px, axis=-1)
+    return float(np.nanquantile(size, 0.95)) if np.isfinite(size).any() else 0.0
+
+
+def _arrows(mean_px: Array, du: float, dv: float) -> list[str]:
+    scale = arrow_scale(ImageMap(1, 1, np.zeros((1, 1)), mean_px)) or 1.0
+    parts = []
+    for r, c in zip(*np.nonzero(np.isfinite(mean_px).all(axis=-1)), strict=True):
+        u, v = mean_px[r, c] / scale * min(du, dv)
+        x, y = (c + 0.5) * du, (r + 0.5) * dv
+        parts.append(f'<path class="arrow" d="M{x:.1f},{y:.1f}l{u:.2f},{v:.2f}"/>')
+        parts.append(f'<circle class="tail" cx="{x:.1f}" cy="{y:.1f}" r="0.9"/>')
+    return parts
+
+
+def top_view(title: str, paths: Sequence[Series]) -> Markup:
+    """Paths seen from above at one scale, with a bar that gives it; squares mark the starts."""
+    drawn = [s for s in paths if np.isfinite(s.y).any()]
+    if not drawn:
+        return Markup("")
+    (x_low, x_high), (y_low, y_high) = _range([s.x for s in drawn]), _range([s.y for s in drawn])
+    span = max(x_high - x_low, y_high - y_low, 1e-6)
+    width, margin = 420.0, 24.0
+    scale = (width - 2 * margin) / span
+    height = (y_high - y_low) * scale + 2 * margin + 26
+
+    def at(x: Array, y: Array) -> list[str]:
+        u, v = margin + (x - x_low) * scale, height - margin - 26 - (y - y_low) * scale
+        return [f"{a:.1f},{b:.1f}" for a, b in zip(u.tolist(), v.tolist(), strict=True)]
+
+    parts = []
+    for series in drawn:
+        parts += _line(series, at)
+        u, v = at(series.x[:1], series.y[:1])[0].split(",")
+        parts.append(
+            f'<rect class="dot c{series.colour % COLOURS}" x="{float(u) - 4:.1f}" y="{float(v) - 4:.1f}" '
+            'width="8" height="8"/>'
+        )
+    bar = ticks(0, span, 4)[1] if len(ticks(0, span, 4)) > 1 else span
+    y = height - 14
+    parts.append(f'<path class="scalebar" d="M{margin:.1f},{y:.1f}h{bar * scale:.1f}"/>')
+    parts.append(f'<text class="tick" x="{margin:.1f}" y="{y - 5:.1f}">{_label(bar)} m</text>')
+    return _svg(title, width, height, parts, "map")
+
+
+def _svg(title: str, width: float, height: float, parts: Sequence[str], css: str) -> Markup:
+    head = (
+        f'<svg class="{css}" viewBox="0 0 {width:.1f} {height:.1f}" role="img" aria-label="{escape(title)}">'
+    )
+    return Markup(head + "".join(parts) + "</svg>")

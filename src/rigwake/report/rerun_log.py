@@ -1,0 +1,68 @@
+"""The rig, its motion and its pictures in the rerun viewer (optional extra `rerun`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigwake.errors import UsageError
+from rigwake.geometry.se3 import SE3
+from rigwake.report.content import RIG_TRAJECTORY, ReportContent
+from rigwake.report.motion import thin
+
+
+def log_to_rerun(content: ReportContent, rrd: Path | None, view: bool) -> None:
+    """Write an `.rrd` file, show it in the viewer, or both. UsageError if rerun is not installed."""
+    try:
+        import rerun
+    except ImportError as error:
+        raise UsageError(
+            "The rerun viewer is not installed.", remedy="pip install 'rigwake[rerun]', then run this again."
+        ) from error
+    stream = rerun.RecordingStream("rigwake")
+    if view:
+        stream.spawn(connect=rrd is None)
+    if rrd is not None:
+        rrd.parent.mkdir(parents=True, exist_ok=True)
+        stream.save(rrd)
+    stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    _log_cameras(rerun, stream, content)
+    _log_motion(rerun, stream, content)
+    stream.flush()
+
+
+def _transform(rerun: Any, parent_from_child: SE3) -> Any:
+    w, x, y, z = parent_from_child.quat_wxyz.tolist()
+    return rerun.Transform3D(
+        translation=parent_from_child.translation.tolist(), quaternion=rerun.Quaternion(xyzw=[x, y, z, w])
+    )
+
+
+def _log_cameras(rerun: Any, stream: Any, content: ReportContent) -> None:
+    """Cameras that are fully determined; a partly known transform has no place in a tree of transforms."""
+    for name, camera in content.calibration.cameras.items():
+        if not camera.is_determined:
+            words = ", ".join(d.words for d in camera.undetermined)
+            stream.log(f"world/rig/{name}", rerun.TextLog(f"not determined: {words}"), static=True)
+            continue
+        stream.log(f"world/rig/{name}", _transform(rerun, camera.rig_from_cam), static=True)
+        if camera.model is not None:
+            size = camera.model.width_px, camera.model.height_px
+            focal = 0.5 * size[0]  # a frustum to look at: the viewer knows pinholes only
+            pinhole = rerun.Pinhole(
+                focal_length=focal, width=size[0], height=size[1], camera_xyz=rerun.ViewCoordinates.RDF
+            )
+            stream.log(f"world/rig/{name}/image", pinhole, static=True)
+
+
+def _log_motion(rerun: Any, stream: Any, content: ReportContent) -> None:
+    rig = content.trajectories.get(RIG_TRAJECTORY)
+    if rig is None:
+        return
+    path = rig.world_from_body.translation[thin(len(rig))]
+    stream.log("world/path", rerun.LineStrips3D([path]), static=True)
+    for k in thin(len(rig), 3000).tolist():
+        stream.set_time("time", timestamp=np.datetime64(int(rig.timestamps_ns[k]), "ns"))
+        stream.log("world/rig", _transform(rerun, rig.world_from_body[k]))

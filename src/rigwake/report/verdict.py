@@ -1,0 +1,159 @@
+"""The verdict in plain words: good, usable or not determined; why, and what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from rigwake.calibration import Calibration
+
+Level = Literal["good", "usable", "not determined"]
+
+# what "good" asks for; each figure is shown beside the verdict
+GOOD_ROTATION_DEG = 0.1
+GOOD_POSITION_M = 0.03
+AGREEING_SIGMAS = 3.0
+GOOD_HAND_OVER_PX = 2.0
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One thing that speaks for or against the calibration, and what to do about it."""
+
+    holds: bool
+    words: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The level, one sentence, and the reasons, the worst first."""
+
+    level: Level
+    sentence: str
+    reasons: tuple[Reason, ...]
+
+
+_SENTENCES: dict[Level, str] = {
+    "good": "Every camera is determined, precisely, and independent checks agree.",
+    "usable": "Every camera is determined, but not everything that was asked of it holds.",
+    "not determined": "The motion in this recording does not fix every camera.",
+}
+
+
+def judge(calibration: Calibration) -> Verdict:
+    """Determined? Precise? Confirmed by checks that the estimate did not use? Residuals do not count."""
+    lost = _undetermined(calibration)
+    reasons = [
+        *lost,
+        *_precision(calibration),
+        _split_half(calibration.checks),
+        _hand_over(calibration.checks),
+    ]
+    level: Level = "not determined" if lost else "good" if all(r.holds for r in reasons) else "usable"
+    return Verdict(level, _SENTENCES[level], tuple(sorted(reasons, key=lambda r: r.holds)))
+
+
+def _undetermined(calibration: Calibration) -> list[Reason]:
+    return [
+        Reason(False, f"Not determined: {direction.words}.", _sentence(direction.remedy))
+        for camera in calibration.cameras.values()
+        for direction in camera.undetermined
+    ]
+
+
+def _sentence(words: str) -> str:
+    return f"{words[:1].upper()}{words[1:].rstrip('.')}." if words else ""
+
+
+def _precision(calibration: Calibration) -> list[Reason]:
+    """The largest standard deviations of rotation and position, against what good asks for."""
+    kinds = (
+        (
+            "looking direction",
+            "°",
+            1.0,
+            GOOD_ROTATION_DEG,
+            "std_rotation_deg",
+            "turn more, in both directions",
+        ),
+        (
+            "position",
+            " mm",
+            1e3,
+            GOOD_POSITION_M,
+            "std_translation_m",
+            "turn more, closer to structures on shore",
+        ),
+    )
+    reasons = []
+    for what, unit, factor, limit, attribute, remedy in kinds:
+        worst = {
+            name: float(np.nanmax(getattr(camera, attribute)))
+            for name, camera in calibration.cameras.items()
+            if np.isfinite(getattr(camera, attribute)).any()
+        }
+        worst = {name: value for name, value in worst.items() if value > 0}  # the reference itself has none
+        if not worst:
+            reasons.append(Reason(False, f"The calibration does not say how sure its {what}s are."))
+            continue
+        name = max(worst, key=lambda n: worst[n])
+        holds = worst[name] <= limit
+        words = (
+            f"{what} known to {worst[name] * factor:.2g}{unit} (1σ) or better; the least sure is {name}"
+            f"{'' if holds else f'; good means at most {limit * factor:g}{unit}'}."
+        )
+        reasons.append(
+            Reason(holds, words[0].upper() + words[1:], "" if holds else f"Record longer: {remedy}.")
+        )
+    return reasons
+
+
+def _number(content: Any, key: str) -> float | None:
+    value = content.get(key) if isinstance(content, Mapping) else None
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _split_half(checks: Mapping[str, Any]) -> Reason:
+    """Both halves of the recording, calibrated by themselves."""
+    halves = checks.get("split_half")
+    sigmas = {name: _number(c, "sigmas") for name, c in halves.items()} if isinstance(halves, Mapping) else {}
+    known = {str(name): value for name, value in sigmas.items() if value is not None}
+    if not known:
+        return Reason(
+            False,
+            "The two halves of the recording were not compared.",
+            "Record at least two turns and rerun.",
+        )
+    name = max(known, key=lambda n: known[n])
+    if known[name] <= AGREEING_SIGMAS:
+        return Reason(True, f"The two halves of the recording agree within {known[name]:.1f} σ.")
+    return Reason(
+        False,
+        f"The two halves of the recording disagree by {known[name]:.1f} σ for {name}: "
+        "the standard deviations are too small, or something moved.",
+        "Look at the residuals over time and the masks; check that the mounts are rigid.",
+    )
+
+
+def _hand_over(checks: Mapping[str, Any]) -> Reason:
+    """Landmarks of one camera, predicted into another that was not used for them."""
+    median = _number(checks.get("hand_over"), "median_px")
+    count = _number(checks.get("hand_over"), "count") or 0
+    if median is None or count == 0:
+        return Reason(
+            False,
+            "No landmark went from one camera to another, so the cameras could not be checked against each other.",
+            "Turn through at least 360 degrees near structures on shore.",
+        )
+    words = f"{count:.0f} landmarks predicted from one camera into another land {median:.2g} px off (median)"
+    if median <= GOOD_HAND_OVER_PX:
+        return Reason(True, f"{words}.")
+    return Reason(
+        False,
+        f"{words}; good means at most {GOOD_HAND_OVER_PX:g} px.",
+        "Look at the hand-over pictures: one camera off in all of them points to its lens or its mount.",
+    )
