@@ -315,3 +315,24 @@ def test_euroc_corners_fit_better_than_the_published_intrinsics(real_recordings:
     assert result.converged
     assert result.camera.params[0] == pytest.approx(published.params[0], rel=0.01)
     assert not result.dropped_views
+
+
+def test_chessboard_corners_are_found_where_they_are() -> None:
+    camera, board = wide_lens("kb4"), parse_board("chessboard:8x6:0.06")
+    cam_from_board = SE3(so3.exp([0.3, -0.2, 0.1]), np.array([0.05, 0.02, 0.35]))
+    image = render_board(camera, board, cam_from_board, np.random.default_rng(0))
+    ids, pixels = detect_corners(board, image)
+    truth, _ = camera.project(cam_from_board * centred_points(board)[ids])
+    assert len(ids) == 48
+    # a chessboard may be read from its other end: the same corners, in reverse
+    error = min(np.linalg.norm(pixels - order, axis=1).max() for order in (truth, truth[::-1]))
+    assert error < 0.3
+
+
+def test_charuco_corners_are_found_where_they_are() -> None:
+    board = parse_board("charuco:7x5:0.04:0.03:5X5_100")
+    image = board.charuco().generateImage((700, 500))
+    ids, pixels = detect_corners(board, image)
+    assert len(ids) == 24
+    # 100 pixels per square; OpenCV's image has its own origin at the corner of the first pixel
+    np.testing.assert_allclose(pixels, board.corner_points[ids, :2] * 2500 - 0.5, atol=0.3)
