@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from rigwake.cameras.kannala_brandt import KannalaBrandt4
 from rigwake.errors import UsageError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
+from rigwake.inspection.inspect import inspect_recording
 from rigwake.readers.open import open_recording
 from rigwake.recording import (
     AttitudeStream,
@@ -53,6 +55,8 @@ class NoiseFrames:
             image = rng.integers(0, 256, shape, dtype=np.uint8)
             if colour and self.grey:
                 image = np.repeat(image[..., None], 3, axis=2)
+            elif not colour and not self.grey:
+                image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
             yield Frame(int(index), int(self.stamps[index]), image)
 
 
@@ -160,6 +164,25 @@ def test_other_streams_come_back(
         assert again.true_rig is not None
         assert again.true_rig.antenna_rig == (0.1, 0.2, 0.3)
         assert list(again.true_trajectories) == ["body"]
+
+
+@pytest.mark.parametrize(("file_format", "name", "encoding"), FORMATS[:-1])
+def test_what_is_written_inspects_the_same(
+    tmp_path: Path, file_format: RecordingFormat, name: str, encoding: str
+) -> None:
+    written = small_recording()
+    write_recording(written, tmp_path / name, file_format=file_format, image_encoding=encoding)  # type: ignore[arg-type]
+    before, after = (inspect_recording(r) for r in (written, open_recording(tmp_path / name)))
+    for camera, seen in after.pictures.items():
+        original = before.pictures[camera]
+        assert seen.mean_level == pytest.approx(original.mean_level, abs=0.6)  # decoders round grey
+        assert (seen.sampled, seen.readable, seen.frozen) == (FRAMES, FRAMES, 0)
+        assert len(seen.rotations) == len(original.rotations)
+    same = [key for key in before.timings if not key.startswith("attitude")]  # folders rename these
+    assert [after.timings[key] == before.timings[key] for key in same] == [True] * len(same)
+    assert before.turning is not None
+    assert after.turning is not None
+    assert after.turning.tilt_std_deg == before.turning.tilt_std_deg
 
 
 def test_existing_folders_are_not_overwritten(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ GAP_PERIODS = 1.6
 """Two stamps further apart than this many median periods enclose dropped samples."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Timing:
     """Timing of one sensor; rates and jitter are NaN where there are fewer than three samples.
 

@@ -72,6 +72,17 @@ class JoinedPayloads:
                 yield from self.parts[part].read(wanted[run] - self.first_rows[part], limit_bytes)
 
 
+@dataclass(frozen=True, eq=False)
+class HeldPayloads:
+    """Messages, or their beginnings, held in memory."""
+
+    messages: Sequence[bytes]
+
+    def read(self, rows: Iterable[int], limit_bytes: int = MAX_MESSAGE_BYTES) -> Iterator[bytes]:
+        """See `Payloads.read`."""
+        return (self.messages[row][:limit_bytes] for row in rows)
+
+
 def joined(channels: Sequence[Channel]) -> tuple[Channel, ...]:
     """One channel per (topic, type): connections of several publishers and files of a split bag are merged."""
     groups: dict[tuple[str, str], list[Channel]] = {}

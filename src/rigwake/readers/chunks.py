@@ -9,7 +9,7 @@ import bz2
 import io
 import os
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -98,39 +98,73 @@ class ChunkedPayloads:
     chunk_rows: NDArray[np.int32]
     offsets: NDArray[np.int64]
 
+    @property
+    def is_packed(self) -> bool:
+        """Whether any chunk is compressed."""
+        return any(chunk.compression != "none" for chunk in self.chunks)
+
     def read(self, rows: Iterable[int], limit_bytes: int = MAX_MESSAGE_BYTES) -> Iterator[bytes]:
         """See `Payloads.read`; holds one unpacked chunk at a time."""
         file = os.open(self.path, os.O_RDONLY)
         try:
-            held, content = -1, b""
+            held, content = -1, None
             for row in rows:
-                chunk_row, offset = int(self.chunk_rows[row]), int(self.offsets[row])
+                chunk_row = int(self.chunk_rows[row])
                 chunk = self.chunks[chunk_row]
-                if chunk.compression != "none" and chunk_row != held:
-                    held, content = chunk_row, self._content(file, chunk)
-                yield self._message(file, chunk, content, offset, limit_bytes)
+                if chunk_row != held:
+                    held, content = chunk_row, _content(file, chunk)
+                yield _message(file, chunk, content, int(self.offsets[row]), self.framing, limit_bytes)
         finally:
             os.close(file)
 
-    def _content(self, file: int, chunk: Chunk) -> bytes:
-        try:
-            return read_chunk(file, chunk)
-        except InputError:
-            return b""  # its messages come out empty, and whoever decodes them counts them as damaged
 
-    def _message(self, file: int, chunk: Chunk, content: bytes, offset: int, limit_bytes: int) -> bytes:
-        direct = chunk.compression == "none"
-        where = chunk.position + offset
-        record = os.pread(file, _PEEK_BYTES, where) if direct else content[offset : offset + _PEEK_BYTES]
-        try:
-            start, message_bytes = message_span(record, self.framing)
-        except InputError:
-            return b""
-        if offset + start + message_bytes > chunk.content_bytes:
-            return b""
-        wanted = min(message_bytes, limit_bytes)
-        if start + wanted <= len(record):
-            return record[start : start + wanted]
-        if direct:
-            return os.pread(file, wanted, where + start)
-        return content[offset + start : offset + start + wanted]
+def _content(file: int, chunk: Chunk) -> bytes | None:
+    """What a packed chunk holds; None for one that is not packed and is read message by message."""
+    if chunk.compression == "none":
+        return None
+    try:
+        return read_chunk(file, chunk)
+    except InputError:
+        return b""  # its messages come out empty, and whoever decodes them counts them as damaged
+
+
+def _message(
+    file: int, chunk: Chunk, content: bytes | None, offset: int, framing: Framing, limit_bytes: int
+) -> bytes:
+    where = chunk.position + offset
+    peek = slice(offset, offset + _PEEK_BYTES)
+    record = os.pread(file, _PEEK_BYTES, where) if content is None else content[peek]
+    try:
+        start, message_bytes = message_span(record, framing)
+    except InputError:
+        return b""
+    if offset + start + message_bytes > chunk.content_bytes:
+        return b""
+    wanted = min(message_bytes, limit_bytes)
+    if start + wanted <= len(record):
+        return record[start : start + wanted]
+    if content is None:
+        return os.pread(file, wanted, where + start)
+    return content[offset + start : offset + start + wanted]
+
+
+def read_together(wanted: Sequence[tuple[ChunkedPayloads, int]]) -> list[list[bytes]]:
+    """All messages of several channels of one file, each cut after its limit; every chunk is unpacked once.
+
+    Otherwise a packed file would be unpacked again for every channel.
+    """
+    messages: list[list[bytes]] = [[] for _ in wanted]
+    if not wanted:
+        return messages
+    first = wanted[0][0]
+    ends = [np.searchsorted(p.chunk_rows, np.arange(len(p.chunks)), side="right") for p, _ in wanted]
+    file = os.open(first.path, os.O_RDONLY)
+    try:
+        for chunk_row, chunk in enumerate(first.chunks):
+            content = _content(file, chunk)
+            for (payloads, limit), end, read in zip(wanted, ends, messages, strict=True):
+                offsets = payloads.offsets[len(read) : end[chunk_row]]
+                read += [_message(file, chunk, content, int(at), first.framing, limit) for at in offsets]
+    finally:
+        os.close(file)
+    return messages

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,11 @@ from rigwake.cameras.base import CameraModel
 from rigwake.cameras.ros import camera_from_info
 from rigwake.errors import CameraError, InputError, UsageError
 from rigwake.geometry.se3 import SE3
-from rigwake.readers.channels import BagIndex, Channel
+from rigwake.readers.channels import BagIndex, Channel, HeldPayloads
+from rigwake.readers.chunks import ChunkedPayloads, read_together
 from rigwake.readers.images import ImageSize
 from rigwake.readers.ros_frames import COMPRESSED, IMAGE_TYPES, RosFrames, first_image_size
-from rigwake.readers.ros_messages import decode_all, has_standard_type, stamped_rows
+from rigwake.readers.ros_messages import HEADER_BYTES, decode_all, has_standard_type, stamped_rows
 from rigwake.readers.ros_sensors import FIX, IMU, POSE_TYPES, read_fix, read_imu, read_poses
 from rigwake.readers.ros_transforms import TF_TYPES, read_moving, read_static
 from rigwake.readers.streams import time_order
@@ -30,7 +31,9 @@ from rigwake.recording import (
 from rigwake.trajectory import Trajectory
 
 _INFO = "sensor_msgs/msg/CameraInfo"
-_ROLE_TYPES = {"camera": IMAGE_TYPES, "imu": {IMU}, "gnss": {FIX}, "attitude": {IMU}, "pose": POSE_TYPES}
+MAX_SENSOR_BYTES = 2**20
+"""A message of a sensor other than a camera that is larger is damage."""
+_ROLE_TYPES = {"camera": IMAGE_TYPES, "imu": {IMU}, "gnss": {FIX}, "pose": POSE_TYPES}
 
 
 @dataclass
@@ -44,6 +47,7 @@ class _Found:
     poses: dict[str, Trajectory] = field(default_factory=dict)
     static_transforms: dict[tuple[str, str], SE3] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
+    headers: dict[str, list[bytes]] = field(default_factory=dict)
 
 
 def recording_from_bag(path: Path, bag: BagIndex, topics: TopicMap) -> Recording:
@@ -57,6 +61,7 @@ def recording_from_bag(path: Path, bag: BagIndex, topics: TopicMap) -> Recording
         if channel.topic not in usable and len(channel) and channel.message_type in _all_types():
             message = f"{channel.topic}: {channel.message_type} is not the standard message; it is left out."
             found.findings.append(Finding("warning", channel.topic, message))
+    usable = _held_where_packed(usable, found)
     readers: Mapping[str, Callable[[str, Channel], None]] = {
         "camera": lambda name, channel: _add_camera(name, channel, usable, found),
         "imu": lambda name, channel: _add_imu(name, channel, found),
@@ -81,6 +86,25 @@ def recording_from_bag(path: Path, bag: BagIndex, topics: TopicMap) -> Recording
         found.static_transforms,
         findings=tuple(found.findings),
     )
+
+
+def _held_where_packed(usable: Mapping[str, Channel], found: _Found) -> dict[str, Channel]:
+    """Of a packed bag all messages but images, and the headers of images, read in one pass over its chunks."""
+    packed = {
+        topic: channel.payloads
+        for topic, channel in usable.items()
+        if isinstance(channel.payloads, ChunkedPayloads) and channel.payloads.is_packed
+    }
+    are_images = {topic: usable[topic].message_type in IMAGE_TYPES for topic in packed}
+    understood = [t for t in packed if usable[t].message_type in _all_types() | {_INFO} | TF_TYPES]
+    wanted = [(packed[t], HEADER_BYTES if are_images[t] else MAX_SENSOR_BYTES) for t in understood]
+    held = dict(usable)
+    for topic, messages in zip(understood, read_together(wanted), strict=True):
+        if are_images[topic]:
+            found.headers[topic] = messages
+        else:
+            held[topic] = replace(usable[topic], payloads=HeldPayloads(messages))
+    return held
 
 
 def _all_types() -> set[str]:
@@ -121,7 +145,7 @@ def _one_topic_per_camera(images: Mapping[str, Channel]) -> dict[str, Channel]:
 
 
 def _add_camera(name: str, channel: Channel, usable: Mapping[str, Channel], found: _Found) -> None:
-    stamped = stamped_rows(name, channel)
+    stamped = stamped_rows(name, channel, found.headers.get(channel.topic))
     order, repaired = time_order(name, stamped.timestamps_ns)
     if not len(order):
         raise InputError(f"{channel.topic} has no readable message.")

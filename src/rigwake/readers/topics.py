@@ -11,7 +11,7 @@ import yaml
 
 from rigwake.errors import InputError, UsageError
 
-ROLES = ("camera", "imu", "gnss", "attitude", "pose")
+ROLES = ("camera", "imu", "gnss", "pose")
 
 # components of image and sensor topics that do not say which sensor it is
 _RECTIFIED_WORDS = {"image_rect", "image_rect_color"}
@@ -22,7 +22,7 @@ _PLAIN_WORDS = {"data", "data_raw", "fix", "raw", "sensor", "sensors"}
 
 @dataclass(frozen=True)
 class TopicMap:
-    """Topics chosen by the user: per role (`camera`, `imu`, `gnss`, `attitude`, `pose`) name -> topic.
+    """Topics chosen by the user: per role (`camera`, `imu`, `gnss`, `pose`) name -> topic.
 
     A role that is given replaces recognition for that role; a role that is not given is recognised.
     """
@@ -56,7 +56,7 @@ class TopicMap:
         return cls(MappingProxyType(roles))
 
 
-_EXAMPLE = "Write camera.front=/a/b, imu=/x, gnss=/y, attitude=/z or pose.base=/w."
+_EXAMPLE = "Write camera.front=/a/b, imu=/x, gnss=/y, or pose.base=/z."
 
 
 def _flat_mapping(file: Path) -> Iterable[tuple[str, str]]:
