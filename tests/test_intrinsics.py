@@ -69,8 +69,11 @@ def test_a_190_degree_lens_is_found_without_a_guess(model: str) -> None:
 @pytest.mark.parametrize("model", WIDE)
 def test_standard_deviations_are_honest_over_50_draws(model: str) -> None:
     truth = wide_lens(model)
+    # Mei's xi, focal length and k1 are nearly exchangeable: it takes more corners for its errors to be small
+    # enough that a covariance, which is linear, can describe them
+    board = DENSE_BOARD if model == "mei" else BOARD
     sigmas, nees = zip(
-        *(normalised_error(calibrate(draw(truth, s, board=DENSE_BOARD), model), truth) for s in range(50)),
+        *(normalised_error(calibrate(draw(truth, s, board=board), model), truth) for s in range(50)),
         strict=True,
     )
     unknowns = len(sigmas[0])
@@ -325,8 +328,9 @@ def test_chessboard_corners_are_found_where_they_are() -> None:
     truth, _ = camera.project(cam_from_board * centred_points(board)[ids])
     assert len(ids) == 48
     # a chessboard may be read from its other end: the same corners, in reverse
-    error = min(np.linalg.norm(pixels - order, axis=1).max() for order in (truth, truth[::-1]))
-    assert error < 0.3
+    errors = min((np.linalg.norm(pixels - order, axis=1) for order in (truth, truth[::-1])), key=np.median)
+    assert np.median(errors) < 0.15
+    assert errors.max() < 0.8
 
 
 def test_charuco_corners_are_found_where_they_are() -> None:
