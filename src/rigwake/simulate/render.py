@@ -119,8 +119,8 @@ class Renderer:
         return seen, colour, surfaces.normal[triangle], lit
 
     def water(self, time_s: float) -> Water:
-        """The sea at a time, with its mip levels."""
-        return _water(self.sea, time_s)
+        """The sea at a time (seconds since the start)."""
+        return water_at(self.sea, time_s)
 
     def render(self, view: View, world_from_rig: SE3, water: Water) -> Floats:
         """Linear radiance (H, W, 3) RGB. world_from_rig: a transform per image row (H,), or one for all.
@@ -263,7 +263,8 @@ def _empty_mirrored(count: int) -> Mirrored:
     return Mirrored(vectors(), vectors(), np.empty(count, np.int32), plain(), plain(), plain(), plain())
 
 
-def _water(sea: WaveField, time_s: float) -> Water:
+def water_at(sea: WaveField, time_s: float) -> Water:
+    """The sea's tiles at a time with their mip levels, and what slope variance each level averages away."""
     cells, starts, lost, at, highest = [], [], [], 0, 0.0
     for tile in sea.tiles:
         surface = tile.surface(time_s)

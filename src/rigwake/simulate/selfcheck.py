@@ -105,7 +105,7 @@ def _place_boards(model: CameraModel, rng: np.random.Generator) -> _Boards:
     seen = np.all([model.unproject(pixels + step)[1] for step in ring], axis=0)
     pixels = pixels[seen]
     rays, _ = model.unproject(pixels)
-    width = np.linalg.norm(model.unproject(pixels + [0.5, 0.0])[0] - rays, axis=1) * 2
+    width = np.linalg.norm(model.unproject(pixels + np.array([0.5, 0.0]))[0] - rays, axis=1) * 2
     helper = rng.standard_normal(rays.shape)
     across = np.cross(helper, rays)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -169,9 +169,9 @@ def motion_agreement(shot: Shot, truth_shot: Shot, first: int, second: int) -> M
     expected, visible = _static_motion(
         shot, seen.ranges_m, later.ranges_m, float(times[first]), float(times[second])
     )
-    dense = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dense = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dense.setFinestScale(0)
-    flow = dense.calc(*pictures, None)
+    flow = dense.calc(pictures[0], pictures[1], np.zeros((*pictures[0].shape, 2), np.float32))
     inner = _inner(seen.labels == shading.LAND) & visible
     flow_error = np.linalg.norm(flow - expected, axis=-1)[inner]
     land, n_land = _klt_share(pictures, expected, inner)

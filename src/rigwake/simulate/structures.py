@@ -186,11 +186,11 @@ def tree(rng: np.random.Generator, atlas: Atlas) -> Mesh:
     height = rng.uniform(5, 10)
     leaves = atlas.number("foliage")
     green = pick(rng, ((1.0, 1.0, 1.0), (0.8, 0.95, 0.7), (1.3, 1.15, 0.7)))
-    parts = [tube((0, 0, 0), (0, 0, 0.6 * height), 0.2, 0.12, atlas.number("planks"), (0.4, 0.33, 0.28), 7)]
+    parts = [tube((0, 0, 0), (0, 0, 0.6 * height), 0.3, 0.2, atlas.number("planks"), (0.4, 0.33, 0.28), 7)]
     for _ in range(int(rng.integers(4, 8))):
-        centre = rng.normal(0, 0.13, 3) * height + [0, 0, 0.66 * height]
-        radius = height * rng.uniform(0.13, 0.24)
-        parts.append(blob(rng, centre, (radius, radius, 0.8 * radius), 0.09, leaves, green, rings=8))
+        centre = rng.normal(0, 0.11, 3) * height + [0, 0, 0.6 * height]
+        radius = height * rng.uniform(0.15, 0.25)
+        parts.append(blob(rng, centre, (radius, radius, 0.8 * radius), 0.09, leaves, green, rings=6))
     return join(parts)
 
 
