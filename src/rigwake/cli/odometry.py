@@ -98,7 +98,6 @@ def _first(streams: Any) -> Any:
     return next(iter(streams.values()), None)
 
 
-Result = "CameraOdometry | RigwakeError"
 Report = Callable[[str, int, int], None]
 
 
