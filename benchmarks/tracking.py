@@ -42,6 +42,7 @@ from tracking_scene import CylinderScene, fisheye, turning_scene, wall_points
 CAMERAS = ("front", "left", "back", "right")
 ZONES_DEG = ((0, 30), (30, 60), (60, 75), (75, 93))
 AGES_S = ((0.0, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 5.05), (5.05, 99.0))
+TABLES = ("speed", "masks", "harbour", "cylinder")
 GROSS_PX = 2.0
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -304,16 +305,21 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?", default=Path(os.environ.get("RIGWAKE_DATA", beside)))
     parser.add_argument("--frames", type=int, default=200, help="frames per camera of harbour_a")
     parser.add_argument("--cameras", nargs="+", default=["front", "left"], choices=CAMERAS)
+    parser.add_argument("--only", nargs="+", default=TABLES, choices=TABLES)
     asked = parser.parse_args()
     folder = asked.folder / "harbour_a"
     if folder.is_dir():
         recording = open_recording(folder / "harbour_a.bag")
-        speed(recording, min(asked.frames, 100))
-        masks(recording, folder)
-        harbour(recording, folder, tuple(asked.cameras), asked.frames)
+        if "speed" in asked.only:
+            speed(recording, min(asked.frames, 100))
+        if "masks" in asked.only:
+            masks(recording, folder)
+        if "harbour" in asked.only:
+            harbour(recording, folder, tuple(asked.cameras), asked.frames)
     else:
         print(f"no {folder}: its tables are left out")
-    cylinder()
+    if "cylinder" in asked.only:
+        cylinder()
 
 
 if __name__ == "__main__":

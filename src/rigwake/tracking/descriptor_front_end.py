@@ -13,7 +13,7 @@ from rigwake.tracking.matching import Keypoints, keypoint_detector, match_descri
 from rigwake.tracking.options import FrontEndName, TrackingOptions
 from rigwake.tracks import Indices
 
-_STD_PX: Final[dict[FrontEndName, float]] = {"sift": 0.5, "orb": 0.8, "fast-brief": 0.8}
+_STD_PX: Final[dict[FrontEndName, float]] = {"sift": 0.15, "orb": 0.45, "fast-brief": 0.5}
 """Standard deviation of a keypoint of the finest scale; measured in `benchmarks/tracking.py`."""
 
 
