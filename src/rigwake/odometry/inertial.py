@@ -150,6 +150,7 @@ def _solve(A: Array, b: Array, scale: float | None, unit: float) -> tuple[Array,
         g += np.einsum("nir,ni->r", weighted, b)
         H[range(4, 7), range(4, 7)] += _LEVER_STD_M**-2.0
         H[range(7, 10), range(7, 10)] += _ACCEL_BIAS_STD**-2.0
+        H[0, 0] += 1e-12  # keeps a camera without any motion solvable: its scale comes out as unknown
         if not free_scale:
             H[0, 0] += 1e12 * unit**2
             g[0] += 1e12 * unit**2 * x[0]
