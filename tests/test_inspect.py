@@ -238,6 +238,7 @@ def test_kitti_is_inspected(
     assert all(seen.readable == seen.sampled for seen in inspection.pictures.values())
 
 
+@pytest.mark.slow
 def test_husky_bag_is_inspected(real_recordings: Path) -> None:
     inspection = inspect_recording(open_recording(real_recordings / "rosbags" / "husky_imu_odom_gps.bag"))
     assert inspection.timings["imu.imu"].samples == 11865

@@ -37,7 +37,10 @@ def run(*command: str) -> str:
 
 
 @pytest.mark.usefixtures("ros1")
-@pytest.mark.parametrize("compression", ["none", "lz4", "bz2"])
+@pytest.mark.parametrize(
+    "compression",
+    ["none", pytest.param("lz4", marks=pytest.mark.slow), pytest.param("bz2", marks=pytest.mark.slow)],
+)
 def test_real_rosbag_accepts_a_written_bag(tmp_path: Path, compression: str) -> None:
     path = tmp_path / "rec.bag"
     write_rosbag1(small_recording(), path, "raw", compression)  # type: ignore[arg-type]

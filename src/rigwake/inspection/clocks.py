@@ -74,8 +74,8 @@ def _mean_rates(imu: ImuStream) -> Callable[[Array, Array], Array]:
     angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
 
     def rates(start: Array, end: Array) -> Array:
-        gained = [np.interp(end, times, angle[:, k]) - np.interp(start, times, angle[:, k]) for k in range(3)]
-        return np.column_stack(gained) / (end - start)[:, None]
+        gained = _interpolated(end, times, angle) - _interpolated(start, times, angle)
+        return np.asarray(gained / (end - start)[:, None])
 
     return rates
 
@@ -172,9 +172,11 @@ class _InertialPath:
 
 
 def _interpolated(at: Array, times: Array, values: Array) -> Array:
-    flat = values.reshape(len(values), -1)
-    columns = [np.interp(at, times, flat[:, k]) for k in range(flat.shape[1])]
-    return np.stack(columns, axis=1).reshape(len(at), *values.shape[1:])
+    """Linear interpolation of values (N, ...) at other times, held constant outside."""
+    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    share = np.clip((at - times[after - 1]) / (times[after] - times[after - 1]), 0.0, 1.0)
+    share = share.reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray((1 - share) * values[after - 1] + share * values[after])
 
 
 def _second_difference(values_at: Callable[[Array], Array], at: Array) -> Array:
