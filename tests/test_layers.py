@@ -14,6 +14,7 @@ LAYERS = [
     ["cameras"],
     ["trajectory", "rig"],
     ["recording", "tracks", "calibration"],
+    ["evaluate"],
     ["readers", "writers"],
     ["inspection"],
     ["intrinsics"],
@@ -24,7 +25,6 @@ LAYERS = [
     ["handeye"],
     ["adjustment"],  # the rig problem: initial values, cross-camera landmarks, outlier rounds
     ["simulate"],
-    ["evaluate"],
     ["exporters"],
     ["report"],
     ["config"],

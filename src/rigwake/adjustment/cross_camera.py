@@ -33,12 +33,14 @@ _REACH_PX = 2.5  # what one registration can bridge
 class HandOverOptions:
     """Options of the search for landmarks in other images.
 
-    views_per_camera: most images of one camera in which a landmark is looked for, spread over the time that it
-        may be seen. max_searches: most in all. search_px: how far from its prediction a landmark may be.
+    rounds: of looking and adjusting. views_per_camera: most images of one camera in which a landmark is looked
+        for, spread over the time that it may be seen. max_searches: most in all.
+    search_px: how far from its prediction a landmark may be.
     max_view_angle_deg, max_stretch: how differently two images may see a patch. min_gap_s: a camera looks again
         for its own landmarks only after so long. min_correlation: with the source's patch.
     """
 
+    rounds: int = 2
     views_per_camera: int = 4
     max_searches: int = 6000
     search_px: float = 3.5

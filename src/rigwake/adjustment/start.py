@@ -16,14 +16,11 @@ from rigwake.bundle.problem import BundleCamera, CameraParameter
 from rigwake.calibration import Calibration
 from rigwake.cameras.base import CameraModel
 from rigwake.errors import RigwakeError, UnobservableError
-from rigwake.geometry.align import Alignment
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
 from rigwake.handeye.calibrate import calibrate_handeye
 from rigwake.handeye.values import HandeyeResult
-from rigwake.odometry.gnss import GnssAlignment, align_gnss, in_enu
-from rigwake.odometry.gyro import GyroAlignment, align_gyro
-from rigwake.odometry.inertial import InertialAlignment, align_inertial
+from rigwake.odometry.metric import metric_start
 from rigwake.recording import GnssStream, ImuStream
 from rigwake.trajectory import Trajectory
 
@@ -59,29 +56,25 @@ def first_rig(
     Raises UnobservableError when no camera can lead: none can be tied to IMU or GNSS, or none has a scale.
     """
     leader = _choose_leader(trajectories)
-    trajectory = _longest_segment(trajectories[leader])
-    guesses = dict(first_offsets_s or {})
-    gyro = None if imu is None else align_gyro(trajectory, imu, time_offset_s=guesses.get(leader))
-    metric, antenna_cam, scale_source, inertial = _make_metric(trajectory, imu, gnss, gyro)
-    result, failed = _tie_others(metric, trajectories, leader)
-    rig_from_leader = _imu_from_leader(gyro, inertial)
-    offset_s = 0.0 if gyro is None else gyro.time_offset_s
-    cameras = {leader: _camera(leader, models[leader], rig_from_leader, offset_s, held=imu is None)}
-    for name, member in result.members.items() if result is not None else ():
-        assert result is not None
-        rig_from_cam = rig_from_leader * result.ref_from_members[name]
-        own = offset_s + (member.time_offset_s or 0.0)
-        cameras[name] = _camera(name, models[name], rig_from_cam, own, held=False)
-    in_order = {name: cameras[name] for name in trajectories if name in cameras}
+    lead = _lead(trajectories[leader], imu, gnss, (first_offsets_s or {}).get(leader))
+    result, failed = _tie_others(lead.world_from_cam, trajectories, leader)
+    cameras = {
+        leader: _camera(leader, models[leader], lead.rig_from_cam, lead.time_offset_s, held=imu is None)
+    }
+    if result is not None:
+        for name, member in result.members.items():
+            rig_from_cam = lead.rig_from_cam * result.ref_from_members[name]
+            offset_s = lead.time_offset_s + (member.time_offset_s or 0.0)
+            cameras[name] = _camera(name, models[name], rig_from_cam, offset_s, held=False)
     start = RigStart(
-        world_from_rig=_of_rig(metric, rig_from_leader, offset_s, "leader" if imu is None else "imu"),
-        cameras=in_order,
-        gyro_bias=np.zeros(3) if gyro is None else gyro.gyro_bias,
-        accel_bias=np.zeros(3) if inertial is None else inertial.accel_bias,
-        antenna_rig=np.zeros(3) if antenna_cam is None else rig_from_leader * antenna_cam,
+        world_from_rig=lead.world_from_rig,
+        cameras={name: cameras[name] for name in trajectories if name in cameras},
+        gyro_bias=lead.gyro_bias,
+        accel_bias=lead.accel_bias,
+        antenna_rig=np.zeros(3) if lead.antenna_rig is None else lead.antenna_rig,
     )
     handeye = Calibration(leader, {}) if result is None else result.calibration()
-    return FirstRig(start, handeye, leader, scale_source, failed)
+    return FirstRig(start, handeye, leader, lead.scale_source, failed, lead.notes)
 
 
 def _camera(name: str, model: CameraModel, rig_from_cam: SE3, offset_s: float, *, held: bool) -> BundleCamera:
@@ -114,34 +107,42 @@ def _longest_segment(trajectory: Trajectory) -> Trajectory:
     return max(segments, key=lambda segment: segment.duration_s)
 
 
-def _make_metric(
-    trajectory: Trajectory, imu: ImuStream | None, gnss: GnssStream | None, gyro: GyroAlignment | None
-) -> tuple[Trajectory, Array | None, str, InertialAlignment | None]:
-    """The leader in metres and in the best world there is; the antenna in its frame; where the scale is from."""
-    located: GnssAlignment | None = None
-    if gnss is not None:
-        located = align_gnss(trajectory, gnss, time_offset_s=0.0 if gyro is None else gyro.time_offset_s)
-        trajectory = in_enu(trajectory, located)
-    inertial = None
-    if imu is not None and gyro is not None:
-        inertial = align_inertial(trajectory, imu, gyro, scale=1.0 if trajectory.is_metric else None)
-        if located is None:
-            trajectory = _levelled(trajectory, inertial)
-    if located is not None:
-        return trajectory, located.antenna_cam, "gnss", inertial
-    source = "imu" if inertial is not None else "trajectory" if trajectory.is_metric else "none"
-    return replace(trajectory, is_metric=True, covariances=None), None, source, inertial
+@dataclass(frozen=True, eq=False)
+class _Lead:
+    """The leading camera in metres, in the best world there is, and the rig it sits on."""
+
+    world_from_cam: Trajectory
+    world_from_rig: Trajectory
+    scale_source: str
+    rig_from_cam: SE3
+    time_offset_s: float
+    gyro_bias: Array
+    accel_bias: Array
+    antenna_rig: Array | None
+    notes: tuple[str, ...]
 
 
-def _levelled(trajectory: Trajectory, inertial: InertialAlignment) -> Trajectory:
-    """In metres, with gravity downwards; the heading stays as it is."""
-    up = -inertial.gravity_visual / np.linalg.norm(inertial.gravity_visual)
-    axis, cosine = np.cross(up, [0.0, 0.0, 1.0]), float(up[2])
-    sine = float(np.linalg.norm(axis))
-    axis = axis / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])
-    turn = SE3.exp(np.concatenate([axis * np.arctan2(sine, cosine), np.zeros(3)]))
-    levelled = Alignment(turn, inertial.scale).apply(trajectory.world_from_body)
-    return replace(trajectory, world_from_body=levelled, is_metric=True, covariances=None)
+def _lead(
+    trajectory: Trajectory, imu: ImuStream | None, gnss: GnssStream | None, offset_s: float | None
+) -> _Lead:
+    if imu is not None or gnss is not None:
+        found = metric_start(trajectory, imu, gnss, time_offset_s=offset_s)
+        return _Lead(
+            found.world_from_cam,
+            found.world_from_rig,
+            found.scale_source,
+            found.rig_from_cam,
+            found.time_offset_s,
+            found.gyro_bias,
+            found.accel_bias,
+            found.antenna_rig,
+            found.notes,
+        )
+    stretch = _longest_segment(trajectory)
+    metric = replace(stretch, is_metric=True, covariances=None)
+    source = "trajectory" if trajectory.is_metric else "none"
+    nothing = np.zeros(3)
+    return _Lead(metric, metric, source, SE3.identity(), 0.0, nothing, nothing, None, ())
 
 
 def _tie_others(
@@ -166,21 +167,3 @@ def _tie_others(
         else:
             good.append(trajectory)
     return (calibrate_handeye(metric, good) if good else None), failed
-
-
-def _imu_from_leader(gyro: GyroAlignment | None, inertial: InertialAlignment | None) -> SE3:
-    if gyro is None:
-        return SE3.identity()
-    lever = np.zeros(3) if inertial is None else inertial.imu_cam
-    return SE3(gyro.imu_from_cam, -gyro.imu_from_cam @ lever)
-
-
-def _of_rig(leader: Trajectory, rig_from_leader: SE3, offset_s: float, name: str) -> Trajectory:
-    """`world_from_rig` on the rig's clock."""
-    return replace(
-        leader,
-        name=leader.name if name == "leader" else name,
-        timestamps_ns=leader.timestamps_ns + round(offset_s * 1e9),
-        world_from_body=leader.world_from_body * rig_from_leader.inverse(),
-        covariances=None,
-    )

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.panel import Panel
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeRemainingColumn
 
 from rigwake.atomic import write_text_atomic
 from rigwake.errors import RigwakeError
@@ -56,3 +58,30 @@ def progress_bar() -> Progress:
         console=err,
         transient=True,
     )
+
+
+class ShareBars:
+    """One bar per name, told by `bars(name, what, share)`."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._tasks: dict[str, TaskID] = {}
+
+    def __call__(self, name: str, what: str, share: float) -> None:
+        """Show that `name` has done this share of `what`."""
+        if name not in self._tasks:
+            self._tasks[name] = self._progress.add_task(name, total=1.0)
+        self._progress.update(self._tasks[name], description=escape(f"{name}: {what}"), completed=share)
+
+
+@contextmanager
+def share_bars() -> Iterator[ShareBars]:
+    """Bars of things done at the same time, on stderr, gone when done."""
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:.0f} %"),
+    )
+    with Progress(*columns, console=err, transient=True) as progress:
+        yield ShareBars(progress)

@@ -1,0 +1,109 @@
+"""Rounds of handing landmarks over between cameras and times: predict, look, add, adjust again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigwake.adjustment.cross_camera import HandOverOptions, find_landmarks, propose_searches
+from rigwake.adjustment.rounds import adjust
+from rigwake.adjustment.values import AdjustedRig, AdjustmentOptions, AssembledProblem
+from rigwake.bundle.problem import Observations
+from rigwake.recording import CameraStream
+from rigwake.tracking.masks import CameraMask, mask_from_file
+
+_KEPT_BACK = 7  # the landmarks of every seventh search are only used to check the result
+
+
+@dataclass(frozen=True, eq=False)
+class HandOver:
+    """What was handed over. used: observations that were added. unused: others kept back, to check the result."""
+
+    used: int
+    unused: Observations
+
+    @classmethod
+    def nothing(cls) -> HandOver:
+        """Nothing was handed over."""
+        return cls(0, Observations.empty())
+
+
+def joined(first: Observations, second: Observations) -> Observations:
+    """These observations, then those."""
+    return Observations(
+        *(np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(Observations))
+    )
+
+
+def adjust_with_hand_over(
+    adjusted: AdjustedRig,
+    streams: Mapping[str, CameraStream],
+    masks_folder: Path,
+    options: AdjustmentOptions,
+    search: HandOverOptions,
+    tell: Callable[[str], None],
+) -> tuple[AdjustedRig, HandOver]:
+    """The rig adjusted with landmarks found again in other cameras and at other times.
+
+    Every round predicts with what the one before has found. In the last, some of the agreeing observations
+    are kept back.
+    """
+    used, unused = 0, Observations.empty()
+    for done in range(search.rounds):
+        problem = adjusted.solution.problem
+        images = _images(problem.observations, [c.name for c in problem.cameras])
+        tell(f"looking for landmarks in other cameras, round {done + 1}")
+        searches = propose_searches(adjusted.solution, images, _masks(masks_folder, streams), search)
+        found = find_landmarks(problem, searches, streams, search)
+        if done == search.rounds - 1:
+            back = found.landmark_indices % _KEPT_BACK == 0
+            found, kept_back = found.take(~back), found.take(back)
+        else:
+            kept_back = Observations.empty()
+        tell(f"adjusting with {len(found)} observations handed over")
+        with_found = AssembledProblem(
+            replace(problem, observations=joined(problem.observations, found)),
+            adjusted.track_cameras,
+            adjusted.track_ids,
+        )
+        before = adjusted
+        adjusted = adjust(with_found, replace(options, rounds=2))
+        used += len(found)
+        unused = _renumbered(kept_back, before, adjusted)
+    return adjusted, HandOver(used, unused)
+
+
+def _images(observations: Observations, names: list[str]) -> dict[str, NDArray[np.int64]]:
+    """Per camera, the stamps of the images that take part."""
+    return {
+        name: np.unique(observations.timestamps_ns[observations.camera_indices == index])
+        for index, name in enumerate(names)
+    }
+
+
+def _masks(folder: Path, streams: Mapping[str, CameraStream]) -> dict[str, CameraMask]:
+    """Masks that the camera stage left."""
+    return {
+        name: mask_from_file(folder / f"{name}.png", stream.width_px, stream.height_px)
+        for name, stream in streams.items()
+        if (folder / f"{name}.png").is_file()
+    }
+
+
+def _renumbered(observations: Observations, before: AdjustedRig, after: AdjustedRig) -> Observations:
+    """The same observations with the landmark numbers of a later round; those whose landmark went are left out."""
+    key_after = {
+        (int(camera), int(track)): row
+        for row, (camera, track) in enumerate(zip(after.track_cameras, after.track_ids, strict=True))
+    }
+    rows = [
+        key_after.get((int(before.track_cameras[k]), int(before.track_ids[k])), -1)
+        for k in observations.landmark_indices
+    ]
+    landmark_indices = np.array(rows, dtype=np.int64)
+    kept = landmark_indices >= 0
+    return replace(observations, landmark_indices=landmark_indices).take(kept)

@@ -1,0 +1,126 @@
+"""`rigwake calibrate REC -o OUT`: the main job."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+import yaml
+from rich.table import Table
+
+from rigwake.cli.console import next_step, out, share_bars, write_json
+from rigwake.cli.topic_options import TopicOption, TopicsOption
+
+if TYPE_CHECKING:
+    from rigwake.calibration import Calibration
+
+
+def command(
+    recording: Annotated[
+        Path | None, typer.Argument(help="ROS bag, MCAP, folder: see `rigwake inspect`.")
+    ] = None,
+    out_folder: Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")] = Path(
+        "rigwake-out"
+    ),
+    reference: Annotated[
+        str | None, typer.Option(help="Frame to report in: imu, base_link or a camera's name.")
+    ] = None,
+    cameras: Annotated[str | None, typer.Option(help="Only these cameras, separated by commas.")] = None,
+    start: Annotated[float | None, typer.Option(help="Skip so many seconds.")] = None,
+    duration: Annotated[float | None, typer.Option(help="Use so many seconds.")] = None,
+    prior: Annotated[
+        Path | None, typer.Option(help="YAML of what is known: tape measures, baselines.")
+    ] = None,
+    trajectories: Annotated[
+        Path | None, typer.Option(help="Folder of CAMERA.tum made by another odometry.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep the stages that a former run finished.")
+    ] = False,
+    jobs: Annotated[int | None, typer.Option(help="Processes (default: one per core).")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of everything random.")] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML file of settings.")] = None,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", help="One setting: adjustment.cross_camera=false.")
+    ] = None,
+    print_config: Annotated[bool, typer.Option("--print-config", help="Show all settings and stop.")] = False,
+    topic: TopicOption = (),
+    topics: TopicsOption = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the result as JSON ('-': print).")
+    ] = None,
+) -> None:
+    """Find where every camera of a recording sits and looks, and how sure that is.
+
+    Example: [cyan]rigwake calibrate sail.bag -o OUT[/cyan]
+
+    Example: [cyan]rigwake calibrate sail.mcap -o OUT --reference base_link --prior tape.yaml[/cyan]
+    """
+    from rigwake.calibration.yaml_file import calibration_to_dict
+    from rigwake.config import load_config
+    from rigwake.errors import UsageError
+    from rigwake.pipeline.calibrate import calibrate
+    from rigwake.pipeline.prior import load_prior
+    from rigwake.readers.topics import TopicMap
+
+    settings = load_config(
+        config,
+        assignments or (),
+        reference=reference,
+        cameras=None if cameras is None else [name.strip() for name in cameras.split(",") if name.strip()],
+        start_s=start,
+        duration_s=duration,
+        jobs=jobs,
+        seed=seed,
+    )
+    if print_config:
+        out.print(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False), end="")
+        return
+    if recording is None:
+        raise UsageError("No recording was given.", remedy="rigwake calibrate RECORDING -o OUT")
+    with share_bars() as bars:
+        run = calibrate(
+            recording,
+            out_folder,
+            settings,
+            topics=TopicMap.from_options(topic, topics),
+            trajectories=trajectories,
+            prior=None if prior is None else load_prior(prior),
+            resume=resume,
+            progress=bars,
+        )
+    if json_file is not None:
+        write_json(json_file, calibration_to_dict(run.calibration))
+    if str(json_file) != "-":
+        print_calibration(run.calibration)
+        for name, reason in run.failed.items():
+            out.print(f"[red]{name} is not calibrated:[/red] {reason}")
+        for note in run.notes:
+            out.print(f"[dim]note: {note}[/dim]")
+        out.print(f"written: {run.out / 'calibration.yaml'}")
+        next_step(f"rigwake report {run.out} --open", "look at it before you believe it")
+
+
+def print_calibration(calibration: Calibration) -> None:
+    """The rig as a table: position with sigmas, sigma of the rotation, clock, repeatability."""
+    table = Table(title=f"cameras in {calibration.reference} (± one sigma)")
+    for heading in ("camera", "x m", "y m", "z m", "± rotation °", "clock ms", "halves apart (sigmas)"):
+        table.add_column(heading, justify="left" if heading == "camera" else "right")
+    halves = calibration.checks.get("split_half", {})
+    for name, camera in calibration.cameras.items():
+        known = camera.determined_axes
+        cells = [
+            f"{x:+.3f} ± {s:.3f}" if ok else "not determined"
+            for x, s, ok in zip(
+                camera.rig_from_cam.translation, camera.std_translation_m, known[3:], strict=True
+            )
+        ]
+        rotation = f"{camera.std_rotation_deg.max():.3f}" if known[:3].all() else "not determined"
+        clock = "–" if camera.time_offset_s is None else f"{1e3 * camera.time_offset_s:+.2f}"
+        apart = halves.get(name, {}).get("sigmas") if isinstance(halves, dict) else None
+        table.add_row(name, *cells, rotation, clock, "–" if apart is None else f"{apart:.1f}")
+    out.print(table)
+    for camera in calibration.cameras.values():
+        for direction in camera.undetermined:
+            out.print(f"[yellow]not determined:[/yellow] {direction.words}. {direction.remedy}")

@@ -1,0 +1,99 @@
+"""Settings of a calibration: one frozen tree, from defaults, a YAML file and `--set a.b=c`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from rigwake.adjustment.cross_camera import HandOverOptions
+from rigwake.adjustment.values import AdjustmentOptions
+from rigwake.errors import UsageError
+from rigwake.odometry.options import OdometryOptions
+from rigwake.readers.truth import read_yaml_mapping
+from rigwake.tracking.options import TrackingOptions
+
+
+class ImuNoiseSettings(BaseModel):
+    """Noise densities of the IMU (rad/s/sqrt(Hz), m/s^2/sqrt(Hz)) and random walks of its biases.
+
+    None: as the recording says, else typical of a middle-class MEMS sensor.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    gyro_noise_density: float | None = Field(default=None, gt=0)
+    accel_noise_density: float | None = Field(default=None, gt=0)
+    gyro_bias_walk: float | None = Field(default=None, gt=0)
+    accel_bias_walk: float | None = Field(default=None, gt=0)
+
+
+class CalibrateConfig(BaseModel):
+    """Everything that can be chosen about `rigwake calibrate`.
+
+    reference: `imu`, `base_link`, a camera's name, or `auto` (the IMU, else the leading camera).
+    cameras: which to calibrate (all by default). start_s, duration_s: the part of the recording to use.
+    jobs: processes (0: as many as there are cores). seed: of everything random.
+    time_offsets: estimate the cameras' clocks. imu, gnss: whether to use them.
+    line_delay_s: read-out time per row of rolling shutters, by camera; estimate_line_delay: refine it.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    reference: str = "auto"
+    cameras: tuple[str, ...] = ()
+    start_s: float = Field(default=0.0, ge=0)
+    duration_s: float | None = Field(default=None, gt=0)
+    min_duration_s: float = Field(default=15.0, gt=0)
+    jobs: int = Field(default=0, ge=0)
+    seed: int = 0
+    time_offsets: bool = True
+    imu: bool = True
+    gnss: bool = True
+    find_hull: bool = True
+    line_delay_s: dict[str, float] = Field(default_factory=dict)
+    estimate_line_delay: bool = False
+    imu_noise: ImuNoiseSettings = ImuNoiseSettings()
+    tracking: TrackingOptions = TrackingOptions()
+    odometry: OdometryOptions = OdometryOptions()
+    adjustment: AdjustmentOptions = AdjustmentOptions()
+    hand_over: HandOverOptions = HandOverOptions()
+
+
+def load_config(file: Path | None = None, assignments: Sequence[str] = (), **options: Any) -> CalibrateConfig:
+    """Settings from a YAML file, then `a.b=c` assignments, then options that are not None.
+
+    Values of assignments are YAML (`cameras=[front, port]`). Raises UsageError naming the key that is wrong.
+    """
+    tree: dict[str, Any] = dict(read_yaml_mapping(file)) if file is not None else {}
+    for assignment in assignments:
+        key, separator, value = assignment.partition("=")
+        if not separator:
+            raise UsageError(
+                f"--set {assignment!r} is not KEY=VALUE.", remedy="Example: --set tracking.max_features=300"
+            )
+        try:
+            parsed = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise UsageError(f"--set {assignment!r}: the value is not YAML.") from error
+        _put(tree, key.strip().split("."), parsed, assignment)
+    tree.update({key: value for key, value in options.items() if value is not None})
+    try:
+        return CalibrateConfig.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise UsageError(
+            f"Setting {where}: {first['msg']}.",
+            remedy="`rigwake calibrate --print-config` shows all settings with their defaults.",
+        ) from error
+
+
+def _put(tree: dict[str, Any], path: list[str], value: Any, assignment: str) -> None:
+    for part in path[:-1]:
+        inner = tree.setdefault(part, {})
+        if not isinstance(inner, dict):
+            raise UsageError(f"--set {assignment!r}: {part} is no group of settings.")
+        tree = inner
+    tree[path[-1]] = value

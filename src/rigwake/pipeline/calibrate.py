@@ -1,0 +1,279 @@
+"""`calibrate`: the whole way from a recording to a rig."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from rigwake import __version__
+from rigwake.adjustment.assemble import assemble_problem
+from rigwake.adjustment.checks import (
+    hand_over_errors,
+    residual_statistics,
+    split_half,
+    split_half_summary,
+)
+from rigwake.adjustment.hand_over import HandOver, adjust_with_hand_over
+from rigwake.adjustment.rounds import adjust
+from rigwake.adjustment.start import FirstRig, first_rig
+from rigwake.adjustment.values import AdjustedRig, RigMeasurements
+from rigwake.adjustment.verdicts import ReferenceFrame, calibrated_cameras
+from rigwake.bundle.covariance import covariance_of
+from rigwake.calibration import Calibration, save_calibration
+from rigwake.config import CalibrateConfig
+from rigwake.errors import InputError, UnobservableError
+from rigwake.geometry.se3 import SE3
+from rigwake.pipeline.camera_stage import (
+    CameraJob,
+    CameraOutcome,
+    load_outcome,
+    odometry_file,
+    outcome_file,
+    tracks_file,
+)
+from rigwake.pipeline.outputs import write_outputs
+from rigwake.pipeline.parallel import Progress, process_cameras
+from rigwake.pipeline.prior import RigPrior
+from rigwake.pipeline.selection import Selection, select
+from rigwake.pipeline.stage_files import StageLedger, input_fingerprint, stage_key
+from rigwake.readers.open import open_recording
+from rigwake.readers.topics import TopicMap
+from rigwake.readers.trajectories import read_trajectory
+from rigwake.recording import Recording
+from rigwake.tracks import load_tracks
+from rigwake.trajectory import Trajectory
+
+_LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "poselib", "rosbags")
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationRun:
+    """A calibration and how it came about. failed: cameras that are not in it, and why."""
+
+    calibration: Calibration
+    out: Path
+    failed: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def _silent(name: str, what: str, share: float) -> None:
+    """Progress that nobody asked for."""
+
+
+def calibrate(
+    recording: Path | str,
+    out: Path | str,
+    config: CalibrateConfig | None = None,
+    *,
+    topics: TopicMap | None = None,
+    trajectories: Path | str | None = None,
+    prior: RigPrior | None = None,
+    resume: bool = False,
+    progress: Progress = _silent,
+) -> CalibrationRun:
+    """Find where every camera of a recording sits and looks.
+
+    out: folder for `calibration.yaml` and what the stages leave; see docs/calibrate.md. trajectories: a folder of
+    `CAMERA.tum` made by another odometry. prior: what is known beforehand. resume: keep finished stages.
+
+    Raises InputError (the recording), UsageError (the settings), UnobservableError (the motion cannot tell),
+    EstimationError (it should, but no trustworthy answer was found). Cameras that fail are left out and named.
+    """
+    config, prior, out = config or CalibrateConfig(), prior or RigPrior(), Path(out)
+    opened = open_recording(recording, topics)
+    selection = select(opened, config)
+    ledger = StageLedger(out, resume=resume)
+    outcomes = _each_camera(selection, Path(recording), out, config, ledger, trajectories is None, progress)
+    working = _working(outcomes)
+    tracks = {name: load_tracks(tracks_file(out, name)) for name in working}
+    first = _start(selection, working, _trajectories(working, out, trajectories), config, prior)
+    save_calibration(first.handeye, out / "initial_rig.yaml")
+    measurements = RigMeasurements(
+        {name: tracks[name] for name in first.start.cameras}, selection.imu, selection.gnss
+    )
+    adjusted, handed_over = _adjust(measurements, first, prior, selection, config, out, progress)
+    failed = {o.name: o.failed for o in outcomes if o.failed is not None} | dict(first.failed)
+    notes = (*selection.notes, *(f"{o.name}: {n}" for o in outcomes for n in o.notes), *first.notes)
+    calibration = _conclude(opened, selection, first, adjusted, handed_over, config, progress)
+    calibration = replace(
+        calibration,
+        checks={**calibration.checks, "failed_cameras": failed, "notes": list(notes)},
+        provenance=_provenance(Path(recording), config, first),
+    )
+    write_outputs(out, calibration, adjusted, first, selection, handed_over)
+    return CalibrationRun(calibration, out, failed, notes)
+
+
+def _each_camera(
+    selection: Selection,
+    recording: Path,
+    out: Path,
+    config: CalibrateConfig,
+    ledger: StageLedger,
+    odometry: bool,
+    progress: Progress,
+) -> list[CameraOutcome]:
+    """Mask, tracks and odometry of every camera; those that a former run finished are read from its files."""
+    settings = config.model_dump(
+        include={"tracking", "odometry", "find_hull", "seed", "start_s", "duration_s", "imu"}
+    )
+    print_of_input = input_fingerprint(recording)
+    keys = {name: stage_key(print_of_input, name, settings, odometry) for name in selection.cameras}
+    outcomes: dict[str, CameraOutcome] = {}
+    jobs = []
+    for name, stream in selection.cameras.items():
+        files = [outcome_file(out, name), tracks_file(out, name)] + (
+            [odometry_file(out, name)] if odometry else []
+        )
+        if ledger.is_done(f"camera {name}", keys[name], *files):
+            outcomes[name] = load_outcome(out, name)
+            progress(name, "taken from the former run", 1.0)
+        else:
+            jobs.append(CameraJob(stream, selection.imu, out, config, odometry))
+    for outcome in process_cameras(jobs, config.jobs, progress) if jobs else ():
+        outcomes[outcome.name] = outcome
+        if outcome.failed is None:
+            ledger.done(f"camera {outcome.name}", keys[outcome.name])
+    return [outcomes[name] for name in selection.cameras]
+
+
+def _working(outcomes: list[CameraOutcome]) -> list[str]:
+    """Cameras that did not fail; raises if none is left."""
+    working = [o.name for o in outcomes if o.failed is None]
+    if working:
+        return working
+    reasons = " ".join(f"{o.name}: {o.failed}" for o in outcomes)
+    raise UnobservableError(
+        f"No camera's motion could be estimated. {reasons}",
+        remedy="Record land with texture in view, while the vessel moves and turns; see `rigwake inspect`.",
+    )
+
+
+def _trajectories(working: list[str], out: Path, foreign: Path | str | None) -> dict[str, Trajectory]:
+    """By camera: of our own odometry, or from a folder of another's."""
+    if foreign is None:
+        return {name: read_trajectory(odometry_file(out, name)).trajectory for name in working}
+    folder = Path(foreign)
+    found = {
+        name: read_trajectory(path, name=name).trajectory
+        for name in working
+        for path in [folder / f"{name}.tum"]
+        if path.is_file()
+    }
+    if not found:
+        raise InputError(
+            f"{folder} holds no trajectory of any camera.",
+            remedy=f"Name the files {', '.join(f'{name}.tum' for name in working)}.",
+        )
+    return found
+
+
+def _start(
+    selection: Selection,
+    working: list[str],
+    trajectories: dict[str, Trajectory],
+    config: CalibrateConfig,
+    prior: RigPrior,
+) -> FirstRig:
+    models = {name: selection.cameras[name].model for name in working}
+    first = first_rig(
+        trajectories,
+        {name: model for name, model in models.items() if model is not None},
+        selection.imu,
+        selection.gnss,
+    )
+    return prior.applied_to(first, config)
+
+
+def _adjust(
+    measurements: RigMeasurements,
+    first: FirstRig,
+    prior: RigPrior,
+    selection: Selection,
+    config: CalibrateConfig,
+    out: Path,
+    progress: Progress,
+) -> tuple[AdjustedRig, HandOver]:
+    """The rig adjustment: alone first, then with landmarks handed over between cameras and times."""
+    assembled = assemble_problem(measurements, first.start, config.adjustment)
+    assembled = replace(assembled, problem=prior.constrained(assembled.problem, first))
+    progress("rig", f"adjusting {len(assembled.problem.observations)} observations", 0.0)
+    adjusted = adjust(assembled, config.adjustment)
+    if not config.adjustment.cross_camera:
+        return adjusted, HandOver.nothing()
+    return adjust_with_hand_over(
+        adjusted,
+        selection.cameras,
+        out / "masks",
+        config.adjustment,
+        config.hand_over,
+        lambda words: progress("rig", words, 0.5),
+    )
+
+
+def _conclude(
+    recording: Recording,
+    selection: Selection,
+    first: FirstRig,
+    adjusted: AdjustedRig,
+    handed_over: HandOver,
+    config: CalibrateConfig,
+    progress: Progress,
+) -> Calibration:
+    """Covariance, verdicts and checks."""
+    progress("rig", "checking", 0.8)
+    solution = adjusted.solution
+    reference = reference_frame(recording, selection, first, config.reference)
+    covariance = covariance_of(solution.problem)
+    statistics = residual_statistics(solution)
+    for name, numbers in statistics.items():
+        numbers |= {"noise_factor": adjusted.noise_factors[name], "dropped": adjusted.dropped[name]}
+    topics = {name: stream.topic for name, stream in selection.cameras.items()}
+    calibration = calibrated_cameras(solution, covariance, reference, statistics, topics)
+    if not any(camera.determined_axes.any() for camera in calibration.cameras.values()):
+        raise UnobservableError(
+            "The motion determined nothing of any camera.",
+            remedy=next(iter(calibration.cameras.values())).undetermined[0].remedy,
+        )
+    return calibration.with_checks(
+        residuals=statistics,
+        split_half=split_half_summary(split_half(solution.problem, reference, config.adjustment)),
+        hand_over=hand_over_errors(solution, handed_over.unused),
+        scale_source=first.scale_source,
+        converged=solution.report.converged,
+    )
+
+
+def reference_frame(
+    recording: Recording, selection: Selection, first: FirstRig, wanted: str
+) -> ReferenceFrame:
+    """The frame to report in; `base_link` needs the recording to say where the IMU sits on it."""
+    if wanted == "auto":
+        wanted = "imu" if selection.imu is not None else first.leader
+    if wanted == "imu" and selection.imu is not None:
+        return ReferenceFrame("imu", SE3.identity())
+    if wanted == "base_link" and selection.imu is not None:
+        base_from_imu = recording.static_transforms.get(("base_link", selection.imu.frame_id))
+        if base_from_imu is None:
+            raise InputError(
+                "The recording does not say where the IMU sits on base_link.",
+                consequence="The cameras are known in the IMU's frame only.",
+                remedy="Use --reference imu, or record /tf_static.",
+            )
+        return ReferenceFrame("base_link", base_from_imu)
+    return ReferenceFrame(wanted, None)
+
+
+def _provenance(recording: Path, config: CalibrateConfig, first: FirstRig) -> dict[str, Any]:
+    return {
+        "rigwake": __version__,
+        "python": platform.python_version(),
+        "libraries": {name: version(name) for name in _LIBRARIES},
+        "inputs": [input_fingerprint(recording)],
+        "settings": config.model_dump(mode="json"),
+        "leader": first.leader,
+    }

@@ -1,0 +1,180 @@
+"""What a calibration leaves in its folder, for reports and for whoever wants to look closer; docs/report.md."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from rigwake.adjustment.cross_camera import camera_from_world
+from rigwake.adjustment.hand_over import HandOver
+from rigwake.adjustment.start import FirstRig
+from rigwake.adjustment.values import AdjustedRig
+from rigwake.atomic import atomic_path, write_text_atomic
+from rigwake.bundle.problem import RigProblem
+from rigwake.calibration import Calibration, save_calibration
+from rigwake.cameras.base import CameraModel
+from rigwake.geometry.so3 import Array
+from rigwake.pipeline.selection import Selection
+from rigwake.recording import CameraStream, Image
+from rigwake.trajectory import Trajectory
+from rigwake.writers.trajectories import write_tum
+
+_MOST_RESIDUALS = 200_000
+_HORIZON_PICTURES = 3  # per camera
+_HAND_OVER_PICTURES = 2  # per camera
+
+
+def write_outputs(
+    out: Path,
+    calibration: Calibration,
+    adjusted: AdjustedRig,
+    first: FirstRig,
+    selection: Selection,
+    handed_over: HandOver,
+) -> None:
+    """Trajectories, residuals, pictures and, last, the calibration itself."""
+    problem = adjusted.solution.problem
+    _write_trajectories(out / "trajectories", problem, selection)
+    _write_residuals(out / "residuals.npz", adjusted)
+    is_level = problem.imu is not None or problem.gnss is not None
+    _write_pictures(out / "pictures", problem, selection.cameras, handed_over, is_level)
+    save_calibration(calibration, out / "calibration.yaml")
+
+
+def _write_trajectories(folder: Path, problem: RigProblem, selection: Selection) -> None:
+    states = problem.states
+    write_tum(Trajectory("rig", states.timestamps_ns, states.world_from_rig), folder / "rig.tum")
+    for camera in problem.cameras:
+        stamps = states.timestamps_ns - round(camera.time_offset_s * 1e9)
+        trajectory = Trajectory(camera.name, stamps, states.world_from_rig * camera.rig_from_cam)
+        write_tum(trajectory, folder / f"{camera.name}.tum")
+
+
+def _write_residuals(path: Path, adjusted: AdjustedRig) -> None:
+    problem = adjusted.solution.problem
+    seen = problem.observations
+    step = max(1, -(-len(seen) // _MOST_RESIDUALS))
+    rows = np.flatnonzero(np.isfinite(adjusted.solution.residuals_px).all(axis=1))[::step]
+    angles = np.full(len(rows), np.nan)
+    for index, camera in enumerate(problem.cameras):
+        own = seen.camera_indices[rows] == index
+        bearings, _ = camera.model.unproject(seen.pixels[rows][own])
+        angles[own] = np.rad2deg(np.arccos(np.clip(bearings[:, 2], -1, 1)))
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(
+            file,
+            camera=seen.camera_indices[rows],
+            camera_names=np.array([camera.name for camera in problem.cameras]),
+            timestamp_ns=seen.timestamps_ns[rows],
+            pixels=seen.pixels[rows].astype(np.float32),
+            residuals_px=adjusted.solution.residuals_px[rows].astype(np.float32),
+            angle_deg=angles.astype(np.float32),
+        )
+
+
+def _write_pictures(
+    folder: Path,
+    problem: RigProblem,
+    streams: Mapping[str, CameraStream],
+    handed_over: HandOver,
+    is_level: bool,
+) -> None:
+    """Some images of every camera with the horizon, and with landmarks handed over from other cameras."""
+    entries: list[dict[str, Any]] = []
+    for index, camera in enumerate(problem.cameras):
+        stream = streams[camera.name]
+        if is_level:
+            for stamp in _spread_stamps(problem, index):
+                cam_from_world = camera_from_world(problem, index, np.array([stamp]))[0]
+                horizon = horizon_pixels(camera.model, cam_from_world.rotation[:, 2])
+                entry = {"kind": "horizon", "horizon_px": horizon.round(1).tolist(), "points": []}
+                entries += _save_picture(folder, stream, stamp, len(entries), entry)
+        for stamp, rows in _busiest_images(handed_over, index):
+            points = _hand_over_points(problem, handed_over, index, stamp, rows)
+            entry = {"kind": "hand_over", "horizon_px": [], "points": points}
+            entries += _save_picture(folder, stream, stamp, len(entries), entry)
+    write_text_atomic(folder / "pictures.json", json.dumps(_without_nan(entries)) + "\n")
+
+
+def _spread_stamps(problem: RigProblem, camera: int) -> list[int]:
+    stamps = np.unique(problem.observations.timestamps_ns[problem.observations.camera_indices == camera])
+    if not len(stamps):
+        return []
+    at = np.linspace(0, len(stamps) - 1, _HORIZON_PICTURES + 2)[1:-1].astype(int)
+    return [int(s) for s in np.unique(stamps[at])]
+
+
+def _busiest_images(handed_over: HandOver, camera: int) -> list[tuple[int, Any]]:
+    unused = handed_over.unused
+    rows = np.flatnonzero(unused.camera_indices == camera)
+    stamps, counts = np.unique(unused.timestamps_ns[rows], return_counts=True)
+    busiest = stamps[np.argsort(-counts, kind="stable")[:_HAND_OVER_PICTURES]]
+    return [(int(stamp), rows[unused.timestamps_ns[rows] == stamp]) for stamp in busiest]
+
+
+def _hand_over_points(
+    problem: RigProblem, handed_over: HandOver, camera: int, stamp: int, rows: Any
+) -> list[dict[str, Any]]:
+    unused, seen = handed_over.unused, problem.observations
+    landmarks = unused.landmark_indices[rows]
+    cam_from_world = camera_from_world(problem, camera, np.array([stamp]))[0]
+    predicted, _ = problem.cameras[camera].model.project(
+        cam_from_world * problem.landmarks.points_world[landmarks]
+    )
+    points = []
+    for k, landmark in enumerate(landmarks):
+        sources = seen.camera_indices[seen.landmark_indices == landmark]
+        source = problem.cameras[int(sources[0])].name if len(sources) else ""
+        points.append(
+            {
+                "predicted_px": predicted[k].round(2).tolist(),
+                "observed_px": unused.pixels[rows[k]].round(2).tolist(),
+                "from_camera": source,
+                "landmark": str(int(landmark)),
+            }
+        )
+    return points
+
+
+def _save_picture(
+    folder: Path, stream: CameraStream, stamp: int, number: int, entry: dict[str, Any]
+) -> list[dict[str, Any]]:
+    index = np.flatnonzero(stream.timestamps_ns == stamp)
+    for frame in stream.frames(index, colour=True):
+        name = f"{stream.name}_{number}.jpg"
+        _write_jpeg(folder / name, frame.image)
+        return [{"camera": stream.name, "file": name, "timestamp_ns": stamp, **entry}]
+    return []
+
+
+def _write_jpeg(path: Path, image: Image) -> None:
+    ok, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    if ok:
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(encoded.tobytes())
+
+
+def horizon_pixels(model: CameraModel, up_cam: Array) -> Array:
+    """(N, 2) pixels of directions at right angles to `up_cam` (3,), in order round the horizon; NaN where the lens
+    does not see it."""
+    side = np.cross(up_cam, np.eye(3)[np.argmin(np.abs(up_cam))])
+    side /= np.linalg.norm(side)
+    ahead = np.cross(up_cam, side)
+    angle = np.linspace(0, 2 * np.pi, 361)[:, None]
+    pixels, valid = model.project(np.cos(angle) * ahead + np.sin(angle) * side)
+    inside = valid & (pixels > -0.5).all(axis=1)
+    inside &= (pixels < np.array([model.width_px, model.height_px]) - 0.5).all(axis=1)
+    return np.asarray(np.where(inside[:, None], pixels, np.nan))
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _without_nan(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(v) for v in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,0 +1,199 @@
+"""What is known of a rig beforehand: tape measures with their doubt, fixed degrees of freedom, known baselines.
+
+cameras:
+  front:
+    rig_from_cam: {quat_wxyz: [w, x, y, z], translation_m: [x, y, z]}   # either may be left out
+    std: {rotation_deg: [x, y, z], translation_m: [x, y, z]}            # rig axes; null: not known, 0: fixed
+baselines:
+  - {cameras: [left, right], distance_m: 1.20, std_m: 0.005}
+antenna: {position_rig_m: [x, y, z], std_m: [x, y, z]}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigwake.adjustment.start import FirstRig
+from rigwake.bundle.problem import (
+    BundleCamera,
+    CameraParameter,
+    DistanceMeasurement,
+    PoseMeasurements,
+    PosePrior,
+    RigProblem,
+    VectorPrior,
+)
+from rigwake.config import CalibrateConfig
+from rigwake.errors import InputError, UsageError
+from rigwake.geometry.se3 import SE3
+from rigwake.geometry.so3 import Array
+from rigwake.readers.truth import read_yaml_mapping
+from rigwake.trajectory import Trajectory
+
+_FIXED_STD = 1e-7  # radians or metres: what a fixed degree of freedom is held with
+_SCALE_STD = 0.005  # share: what the scale of a foreign metric trajectory is trusted with
+
+
+@dataclass(frozen=True, eq=False)
+class Baseline:
+    """A known distance between two cameras, metres."""
+
+    first: str
+    second: str
+    distance_m: float
+    std_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class RigPrior:
+    """Priors of cameras by name (transform and six standard deviations in rig axes), baselines, antenna."""
+
+    cameras: Mapping[str, PosePrior] = field(default_factory=dict)
+    baselines: tuple[Baseline, ...] = ()
+    antenna: VectorPrior | None = None
+
+    def applied_to(self, first: FirstRig, config: CalibrateConfig) -> FirstRig:
+        """First values with these priors, with the scale of a known baseline if there is no other, and with what
+        the settings hold fixed. Raises UsageError for cameras that are not there."""
+        cameras = dict(first.start.cameras)
+        for name in self.cameras:
+            if name not in cameras:
+                raise UsageError(
+                    f"The prior names a camera {name!r}.", remedy=f"There are: {', '.join(cameras)}."
+                )
+        if first.scale_source == "none" and self.baselines:
+            first = _scaled(first, self.baselines)
+            cameras = dict(first.start.cameras)
+        for name, camera in cameras.items():
+            cameras[name] = _prepared(camera, self.cameras.get(name), config)
+        return replace(first, start=replace(first.start, cameras=cameras))
+
+    def constrained(self, problem: RigProblem, first: FirstRig) -> RigProblem:
+        """The problem with the antenna's prior and with the gauge held that no sensor determines."""
+        if self.antenna is not None:
+            problem = replace(problem, antenna=replace(problem.antenna, prior=self.antenna))
+        if problem.gnss is not None:
+            return problem
+        states = problem.states
+        if problem.imu is not None:
+            # gravity gives roll and pitch; heading and position are free
+            std = np.array([1.0, 1.0, 1e-4, 1e-4, 1e-4, 1e-4])
+            axes = np.kron(np.eye(2), states.world_from_rig.rotation[0])
+            covariance = axes.T @ np.diag(std**2) @ axes
+            return replace(
+                problem,
+                poses=PoseMeasurements(np.array([0]), states.world_from_rig[:1], covariance[None]),
+            )
+        fixed = np.zeros(len(states), dtype=bool)
+        fixed[0] = True
+        problem = replace(problem, states=replace(states, fixed=fixed))
+        reach = np.linalg.norm(
+            states.world_from_rig.translation - states.world_from_rig.translation[0], axis=1
+        )
+        farthest = int(reach.argmax())
+        distance = float(reach[farthest])
+        return replace(
+            problem, distances=(DistanceMeasurement(0, farthest, distance, _SCALE_STD * distance),)
+        )
+
+
+def _prepared(camera: BundleCamera, prior: PosePrior | None, config: CalibrateConfig) -> BundleCamera:
+    free: set[CameraParameter] = set(camera.free)
+    if not config.time_offsets:
+        free.discard("time_offset")
+    delay = config.line_delay_s.get(camera.name, 0.0)
+    if config.estimate_line_delay and camera.name in config.line_delay_s:
+        free.add("line_delay")
+    return replace(
+        camera,
+        free=frozenset(free),
+        rig_from_cam_prior=prior,
+        line_delay_s=delay,
+        reference_row_px=0.0,
+        time_offset_s=camera.time_offset_s if config.time_offsets else 0.0,
+    )
+
+
+def _scaled(first: FirstRig, baselines: tuple[Baseline, ...]) -> FirstRig:
+    """Everything in metres, by the ratio of the known to the estimated baselines."""
+    cameras, ratios = first.start.cameras, []
+    for baseline in baselines:
+        if baseline.first in cameras and baseline.second in cameras:
+            a, b = cameras[baseline.first].rig_from_cam, cameras[baseline.second].rig_from_cam
+            ratios.append(baseline.distance_m / float(np.linalg.norm(a.translation - b.translation)))
+    if not ratios:
+        return first
+    scale = float(np.median(ratios))
+
+    def grown(x: SE3) -> SE3:
+        return SE3(x.rotation, scale * x.translation)
+
+    trajectory: Trajectory = replace(
+        first.start.world_from_rig, world_from_body=grown(first.start.world_from_rig.world_from_body)
+    )
+    start = replace(
+        first.start,
+        world_from_rig=trajectory,
+        cameras={name: replace(c, rig_from_cam=grown(c.rig_from_cam)) for name, c in cameras.items()},
+    )
+    return replace(first, start=start, scale_source="baseline")
+
+
+def load_prior(path: Path | str) -> RigPrior:
+    """Read a prior; raises InputError that names what is wrong."""
+    path = Path(path)
+    content = read_yaml_mapping(path)
+    unknown = set(content) - {"cameras", "baselines", "antenna"}
+    if unknown:
+        raise InputError(f"{path}: unknown keys {', '.join(sorted(map(str, unknown)))}.")
+    try:
+        cameras = {str(name): _camera_prior(entry) for name, entry in (content.get("cameras") or {}).items()}
+        baselines = tuple(
+            Baseline(str(b["cameras"][0]), str(b["cameras"][1]), float(b["distance_m"]), float(b["std_m"]))
+            for b in content.get("baselines") or ()
+        )
+        antenna = content.get("antenna")
+        known = (
+            None
+            if antenna is None
+            else VectorPrior.from_std(_vector(antenna["position_rig_m"], 0.0), _std(antenna["std_m"], 1.0))
+        )
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise InputError(
+            f"{path} is no prior: {type(error).__name__}: {error}.",
+            remedy="See docs/calibrate.md: cameras.NAME.{rig_from_cam, std}, baselines, antenna.",
+        ) from error
+    return RigPrior(cameras, baselines, known)
+
+
+def _camera_prior(entry: Mapping[str, Any]) -> PosePrior:
+    transform, std = entry["rig_from_cam"], entry.get("std") or {}
+    quat = transform.get("quat_wxyz")
+    translation = transform.get("translation_m")
+    mean = SE3.from_quat_wxyz([1, 0, 0, 0] if quat is None else quat, _vector(translation, 0.0))
+    nothing = [None, None, None]
+    rotation_std = _std(nothing if quat is None else std.get("rotation_deg", nothing), np.deg2rad(1.0))
+    translation_std = _std(nothing if translation is None else std.get("translation_m", nothing), 1.0)
+    if translation is not None:
+        translation_std = np.where([x is None for x in translation], np.inf, translation_std)
+    return PosePrior.in_axes_of_a(mean, np.concatenate([rotation_std, translation_std]))
+
+
+def _vector(values: Any, otherwise: float) -> Array:
+    array = np.array([otherwise if v is None else float(v) for v in (values or [None] * 3)])
+    if array.shape != (3,):
+        raise ValueError(f"three numbers are wanted, not {values!r}")
+    return array
+
+
+def _std(values: Any, unit: float) -> Array:
+    """Standard deviations: null is unknown, 0 is fixed."""
+    array = np.array([np.inf if v is None else max(float(v) * unit, _FIXED_STD) for v in values])
+    if array.shape != (3,):
+        raise ValueError(f"three standard deviations are wanted, not {values!r}")
+    return array

@@ -1,0 +1,62 @@
+"""The files that stages leave, so that a run can be looked into, resumed, and fed with foreign results."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from rigwake.atomic import write_text_atomic
+
+_LEDGER = "stages.json"
+_HASHED_BYTES = 1 << 20
+
+
+def input_fingerprint(path: Path) -> dict[str, Any]:
+    """What identifies an input: name, size, and SHA-256 of its first and last MiB (of a folder: its listing)."""
+    digest = hashlib.sha256()
+    if path.is_dir():
+        files = sorted(p for p in path.rglob("*") if p.is_file())
+        for file in files:
+            digest.update(f"{file.relative_to(path)} {file.stat().st_size}\n".encode())
+        size = sum(file.stat().st_size for file in files)
+    else:
+        size = path.stat().st_size
+        with path.open("rb") as handle:
+            digest.update(handle.read(_HASHED_BYTES))
+            if size > _HASHED_BYTES:
+                handle.seek(max(size - _HASHED_BYTES, _HASHED_BYTES))
+                digest.update(handle.read(_HASHED_BYTES))
+    return {"path": path.name, "bytes": size, "sha256_of_ends": digest.hexdigest()}
+
+
+def stage_key(*parts: Any) -> str:
+    """A short hash of everything that a stage's result depends on (JSON-able values)."""
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+class StageLedger:
+    """Which stage files of OUT are whole, and what they were made from."""
+
+    def __init__(self, folder: Path, *, resume: bool) -> None:
+        self.folder = folder
+        self._done: dict[str, str] = {}
+        path = folder / _LEDGER
+        if resume and path.is_file():
+            try:
+                content = json.loads(path.read_text(encoding="utf-8"))
+            except ValueError:
+                content = {}
+            if isinstance(content, dict):
+                self._done = {str(k): str(v) for k, v in content.items()}
+
+    def is_done(self, stage: str, key: str, *files: Path) -> bool:
+        """Whether the stage was finished with this key and its files are still there."""
+        return self._done.get(stage) == key and all(file.is_file() for file in files)
+
+    def done(self, stage: str, key: str) -> None:
+        """Note that the stage's files are whole."""
+        self._done[stage] = key
+        write_text_atomic(self.folder / _LEDGER, json.dumps(self._done, indent=1) + "\n")
