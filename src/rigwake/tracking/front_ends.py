@@ -88,7 +88,7 @@ def _front_end(model: CameraModel, options: TrackingOptions) -> FrontEnd:
 
 def _static_region(stream: CameraStream, options: TrackingOptions, mask: CameraMask | None) -> Mask:
     """Where points may be in every frame."""
-    usable = lens_mask(stream).usable if mask is None or "lens" not in mask.excluded else mask.usable
+    usable = lens_mask(stream).usable
     if mask is not None:
         usable &= mask.usable
     # a patch that reaches over the edge of the lens or the hull would hold on to it

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rigwake.cameras.base import Mask
 from rigwake.errors import EstimationError, UnobservableError
 from rigwake.recording import CameraStream
-from rigwake.tracking.masks import shrunk
+from rigwake.tracking.masks import beyond_image_circle, shrunk
 
 _STEADY_SHARE = 0.6  # of the gradient's power over time; random directions give 1 / frames
 _MIN_GRADIENT = 1.5  # grey levels per px, of the mean over time: far above what noise leaves
@@ -32,6 +32,7 @@ def find_hull(stream: CameraStream, usable: Mask, *, frames: int = 60, margin_px
     closed to outlines, and the outlines filled. Raises EstimationError if hardly any frame can be read, and
     UnobservableError if most of the image stands still: then the boat did not turn, and all would be hull.
     """
+    usable = usable & ~beyond_image_circle(stream)  # its outline stands still, too
     steady, textured = _steady_edges(stream, frames)
     inner = shrunk(usable, _BORDER_PX)
     textured &= inner
