@@ -135,7 +135,7 @@ def test_board_pose_of_a_board_behind_the_image_plane() -> None:
 
 
 def test_cross_validation_prefers_the_model_that_made_the_corners() -> None:
-    scores = cross_validate(draw(wide_lens("kb4"), 6), ["fov", "kb4", "pinhole"])
+    scores = cross_validate(draw(wide_lens("kb4"), 6, 10), ["fov", "kb4"])
     assert choose(scores) == "kb4"
     held_out = {score.model: score.held_out_px for score in scores}
     assert held_out["kb4"] == pytest.approx(NOISE_PX * np.sqrt(2), rel=0.1)
@@ -190,11 +190,7 @@ def test_a_parameter_without_effect_is_flagged_not_printed() -> None:
 
 def test_a_wrong_board_is_refused() -> None:
     observations = draw(wide_lens("kb4"), 1)
-    bent = [
-        BoardView(v.name, v.points_board * [1, 1 + 0.4 * (k % 3), 1] ** np.array([1, 1, 1]), v.pixels)
-        for k, v in enumerate(observations.views)
-    ]
-    bent = [replace(v, points_board=np.roll(v.points_board, 7, axis=0)) for v in bent]
+    bent = [replace(v, points_board=np.roll(v.points_board, 7, axis=0)) for v in observations.views]
     with pytest.raises(EstimationError):
         calibrate(replace(observations, views=tuple(bent)), "kb4")
 
