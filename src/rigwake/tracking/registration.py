@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from rigwake.cameras.base import Mask
 from rigwake.geometry.so3 import Array
 from rigwake.tracking.interpolation import Coefficients, sample, sample_with_gradient
+from rigwake.tracking.small_solve import cholesky_solve, position_spread
 
 Floats = NDArray[np.float32]
 
@@ -263,7 +264,7 @@ def _register(
             variance[n] = max(power / freedom, _MIN_VARIANCE)
             correlation[n] = sums[_ROWS - 1] / sqrt(sums[_ROWS - 1] ** 2 + power)
             if found[n]:  # converged in the step before: these are the final residuals
-                spread[n] = _position_spread(matrix)
+                spread[n] = position_spread(matrix)
                 _neighbour_products(values, pattern[n], sums, lower_right, lower_left, lag_sums[n])
                 break
             strayed = prediction_from_patch @ warps[n]
@@ -333,7 +334,7 @@ def _normal_equations(
 def _step(matrix: Array, step: Array, pixel: Array, warp: Array) -> float:
     """Solve for the template's increment and compose its inverse with the warp (in place); pixels moved,
     negative if it cannot be done. `matrix` is left as its Cholesky factor."""
-    if not _cholesky_solve(matrix, step):
+    if not cholesky_solve(matrix, step):
         return -1.0
     increment = np.array([[1.0 + step[2], step[3]], [step[4], 1.0 + step[5]]])
     determinant = increment[0, 0] * increment[1, 1] - increment[0, 1] * increment[1, 0]
@@ -345,47 +346,6 @@ def _step(matrix: Array, step: Array, pixel: Array, warp: Array) -> float:
     pixel[0] -= dx
     pixel[1] -= dy
     return sqrt(dx * dx + dy * dy)
-
-
-@register_jitable
-def _cholesky_solve(matrix: Array, right_side: Array) -> bool:
-    """Solve in place by L L^T, leaving L in the lower half; False if not positive definite."""
-    n = len(right_side)
-    for i in range(n):
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= matrix[i, k] * matrix[j, k]
-            if i > j:
-                matrix[i, j] = total / matrix[j, j]
-            elif total > 1e-9:
-                matrix[i, i] = sqrt(total)
-            else:
-                return False
-        for k in range(i):
-            right_side[i] -= matrix[i, k] * right_side[k]
-        right_side[i] /= matrix[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            right_side[i] -= matrix[k, i] * right_side[k]
-        right_side[i] /= matrix[i, i]
-    return True
-
-
-@register_jitable
-def _position_spread(factor: Array) -> float:
-    """Mean of the first two diagonal entries of `(L L^T)^-1`."""
-    total = 0.0
-    column = np.empty(len(factor))
-    for axis in range(2):
-        column[:] = 0.0
-        for i in range(len(factor)):
-            right_side = 1.0 if i == axis else 0.0
-            for k in range(i):
-                right_side -= factor[i, k] * column[k]
-            column[i] = right_side / factor[i, i]
-        total += np.dot(column, column)
-    return total / 2
 
 
 @register_jitable
