@@ -87,13 +87,11 @@ def image_points(count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def write_tracks(path: Path, name: str, stamps: np.ndarray, count: int, rng: np.random.Generator) -> None:
-    frames = np.sort(rng.integers(0, len(stamps), count))
-    ids = rng.integers(0, max(count // 15, 1), count)
-    pairs = np.unique(np.stack([frames, ids], axis=1), axis=0)
+    ids_in_all = max(count // 15, 1)
+    keys = np.unique(rng.integers(0, len(stamps), count) * ids_in_all + rng.integers(0, ids_in_all, count))
+    pairs = np.stack([keys // ids_in_all, keys % ids_in_all], axis=1)
     pixels = image_points(len(pairs), rng)
-    report = TrackingReport(
-        len(stamps) + 3, len(stamps), 1, 2, 0, len(set(ids.tolist())), len(pairs), 41.0
-    )
+    report = TrackingReport(len(stamps) + 3, len(stamps), 1, 2, 0, ids_in_all, len(pairs), 41.0)
     bearings = np.tile([0.0, 0, 1], (len(pairs), 1))
     Tracks(name, stamps, pairs[:, 0], pairs[:, 1], pixels, bearings, np.full(len(pairs), 0.3), report).save(
         path

@@ -44,14 +44,14 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: build_report(folder / name) for name in ("good", "lost")}
 
 
-@pytest.fixture
-def browser(tmp_path: Path) -> Iterator:
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator:
     binary, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if binary is None or driver is None:
         pytest.skip("chromium and chromium-driver are not installed")
     options = Options()
     options.binary_location = binary
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path / 'profile'}"):
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     session = webdriver.Chrome(options=options, service=Service(driver))
@@ -63,7 +63,7 @@ def open_page(browser, page: Path, width: int = 1280, dark: bool = False) -> Non
     metrics = {"width": width, "height": 1000, "deviceScaleFactor": 1, "mobile": width < 500}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
     scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [scheme]})
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "", "features": [scheme]})
     browser.get(page.as_uri())
     assert browser.execute_script("return document.documentElement.dataset.ready") == "yes"
 
@@ -81,7 +81,8 @@ def requests_of(browser) -> set[str]:
 
 def test_no_errors_no_requests_and_quick(browser, pages: dict[str, Path]) -> None:
     browser.get("about:blank")
-    browser.get_log("performance")  # what the browser's own start page asked for
+    browser.get_log("performance")  # what came before, such as the browser's own start page
+    browser.get_log("browser")
     open_page(browser, pages["good"])
     for tab in TABS:
         show(browser, tab)
@@ -192,11 +193,13 @@ def test_print_shows_every_panel(browser, pages: dict[str, Path]) -> None:
 def test_without_scripts_everything_is_there(browser, pages: dict[str, Path]) -> None:
     browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     browser.get(pages["good"].as_uri())
-    assert all(browser.find_element(By.ID, tab).is_displayed() for tab in TABS)
+    try:
+        assert all(browser.find_element(By.ID, tab).is_displayed() for tab in TABS)
+    finally:
+        browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
 
 
-@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-@pytest.mark.parametrize("name", ["good", "lost"])
+@pytest.mark.parametrize(("name", "dark"), [("good", False), ("lost", True)], ids=["light", "dark"])
 def test_accessibility(browser, pages: dict[str, Path], name: str, dark: bool) -> None:
     if not AXE.is_file():
         pytest.skip("axe-core is not installed: npm install --prefix .venv/axe axe-core")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake.calibration.describe import as_html, as_text
 from rigwake.cameras.base import CameraModel
 from rigwake.errors import InputError, UsageError
 from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
@@ -140,7 +141,7 @@ class CalibratedCamera:
         return tuple(known)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
     """A calibrated rig.
 
@@ -158,6 +159,13 @@ class Calibration:
     antenna_covariance: Array | None = None
     checks: Mapping[str, Any] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return as_text(self)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        return as_html(self)
 
     def camera(self, name: str) -> CalibratedCamera:
         """The camera of this name; UsageError lists what is there."""

@@ -1,0 +1,57 @@
+"""The examples of the documentation run, and the messages that it explains exist."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from calibrated_rigs import PINHOLE, boat, without_vertical
+from rigwake.calibration import save_calibration
+
+ROOT = Path(__file__).parent.parent
+EXAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.DOTALL)
+
+
+@pytest.mark.parametrize("code", EXAMPLES, ids=range(len(EXAMPLES)))
+def test_examples_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, code: str
+) -> None:
+    save_calibration(boat(lens=PINHOLE), tmp_path / "OUT" / "calibration.yaml")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "docs/python.md", "exec"), {})
+    assert capsys.readouterr().out.strip()
+
+
+def test_there_are_three_examples() -> None:
+    assert len(EXAMPLES) >= 3
+
+
+def test_a_notebook_shows_a_table_without_made_up_numbers() -> None:
+    rig = without_vertical(boat(), "port")
+    assert rig._repr_html_().count("<tr>") == 5
+    assert "port: x y z 410.0 ± 4, 830.0 ± 11, not determined mm" in repr(rig)
+    assert "nan" not in rig._repr_html_() + repr(rig)
+
+
+def source_text() -> str:
+    """All string literals of the package, adjacent ones joined, what is inserted left out."""
+    literals = []
+    for path in (ROOT / "src" / "rigwake").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.JoinedStr):
+                literals += [part.value for part in node.values if isinstance(part, ast.Constant)]
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                literals.append(node.value)
+    return "\n".join(literals)
+
+
+def test_messages_in_the_faq_are_messages_of_the_program() -> None:
+    rows = re.findall(r"^\| `(.+?)`", (ROOT / "docs" / "faq.md").read_text(), re.MULTILINE)
+    assert len(rows) > 10
+    known = source_text()
+    for message in rows:
+        fragments = [f for f in re.split(r"\.\.\.|\d[\d.]*", message) if len(f.split()) >= 2]
+        assert fragments, message
+        for fragment in fragments:
+            assert fragment.strip() in known, message
