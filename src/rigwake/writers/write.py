@@ -16,7 +16,8 @@ RecordingFormat = Literal["ros1", "ros2", "mcap", "euroc", "folder"]
 
 def format_of_path(path: Path) -> RecordingFormat:
     """`.bag` is a ROS 1 bag, `.mcap` a ROS 2 MCAP file, anything else a plain folder."""
-    return {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix, "folder")  # type: ignore[return-value]
+    formats: dict[str, RecordingFormat] = {".bag": "ros1", ".mcap": "mcap"}
+    return formats.get(path.suffix, "folder")
 
 
 def write_recording(
