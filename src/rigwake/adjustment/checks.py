@@ -82,7 +82,7 @@ def split_half(
         try:
             part = part_of(problem, first, last, options.min_observations)
             solution = solve(part, SolverOptions(tolerance=1e-5))
-            covariance = covariance_of(solution.problem)
+            covariance = covariance_of(solution.problem, clustered=True)
             halves.append(calibrated_cameras(solution, covariance, reference, {}, {}))
         except RigwakeError as error:
             return str(error)

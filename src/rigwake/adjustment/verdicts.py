@@ -123,8 +123,7 @@ def _rows(
 
 def _with_open_directions(covariance: RigCovariance, rows: Array) -> Array:
     """Covariance of `rows @ parameters` in which undetermined directions have a size as good as none."""
-    good = covariance.determined
-    half = (rows * covariance.scale) @ covariance.directions[:, good] / np.sqrt(covariance.shares[good])
+    half = covariance.spread(rows)
     joint = half @ half.T
     lost = rows @ covariance.undetermined.T
     if lost.shape[1]:

@@ -10,12 +10,13 @@ or a damped inverse would print a number there; this module prints none.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 from threadpoolctl import threadpool_limits
 
+from rigwake.bundle.clusters import clustered_scatter
 from rigwake.bundle.envelope import Factor, NotPositiveDefiniteError
 from rigwake.bundle.layout import Layout
 from rigwake.bundle.normal import ReducedEquations
@@ -37,7 +38,8 @@ class RigCovariance:
     scale: (k,) inverse roots of the information that each has when all else is known. shares: (k,) eigenvalues
     of the scaled information, increasing. directions: (k, k) eigenvectors as columns, in scaled parameters.
     state_covariances: (N, d, d) of the states' own components, or None if they were not asked for; held
-    components are zero, and undetermined directions of shared parameters count as held.
+    components are zero, and undetermined directions of shared parameters count as held. excess: (g, g) what
+    errors that last along tracks add, in whitened determined directions (see `clusters.py`), or None.
     """
 
     layout: Layout
@@ -46,6 +48,7 @@ class RigCovariance:
     shares: Array
     directions: Array
     state_covariances: Array | None = None
+    excess: Array | None = None
 
     @property
     def determined(self) -> Mask:
@@ -68,11 +71,19 @@ class RigCovariance:
         components = scaled @ self.directions
         lost = np.linalg.norm(components[:, ~good], axis=1)
         determined = lost <= _TOUCHED * np.maximum(np.linalg.norm(components, axis=1), 1e-300)
-        half = components[:, good] / np.sqrt(self.shares[good])
+        half = self.spread(rows)
         covariance = half @ half.T
         covariance[~determined] = np.nan
         covariance[:, ~determined] = np.nan
         return covariance, np.asarray(determined)
+
+    def spread(self, rows: Array) -> Array:
+        """(q, g) root of the covariance of `rows @ parameters` (q, k), determined directions only."""
+        good = self.determined
+        half = (np.atleast_2d(rows) * self.scale) @ self.directions[:, good] / np.sqrt(self.shares[good])
+        if self.excess is None:
+            return np.asarray(half)
+        return np.asarray(half @ np.linalg.cholesky(np.eye(len(self.excess)) + self.excess))
 
     def rows_of(self, owner: str, parameter: str) -> Array:
         """(w, k) rows that select a parameter: `("front", "rig_from_cam")`, `("antenna", "position_rig")`.
@@ -95,17 +106,23 @@ class RigCovariance:
 
 
 def covariance_of(
-    problem: RigProblem, options: SolverOptions | None = None, *, states: bool = False
+    problem: RigProblem,
+    options: SolverOptions | None = None,
+    *,
+    states: bool = False,
+    clustered: bool = False,
 ) -> RigCovariance:
     """Covariances at the values of a problem, which should be its optimum (`solution.problem`).
 
     options: those of the solve: weights of robust losses count. states: also the marginal covariances of all
-    states (by selected inversion). Raises EstimationError if a state has no information at all.
+    states (by selected inversion). clustered: widen the shared parameters' by errors that last along tracks.
+    Raises EstimationError if a state has no information at all.
     """
     wanted = options or SolverOptions()
     with threadpool_limits(limits=1, user_api="blas"):
         structure = structure_of(problem)
-        equations, _ = equations_of(linearised(problem, structure, wanted), structure, damping=0.0)
+        linear = linearised(problem, structure, wanted)
+        equations, _ = equations_of(linear, structure, damping=0.0)
         try:
             reduced = equations.damped(_ROUNDING).factorise()
         except NotPositiveDefiniteError as error:
@@ -117,11 +134,20 @@ def covariance_of(
         scale = 1 / np.sqrt(np.maximum(equations.diagonal[n:], np.finfo(float).tiny ** 0.5))
         shares, directions = np.linalg.eigh(reduced.shared * np.outer(scale, scale))
         found = RigCovariance(structure.layout, reduced.shared, scale, shares, directions)
-        if not states:
-            return found
-        return RigCovariance(
-            found.layout, found.information, scale, shares, directions, _of_states(found, reduced)
-        )
+        if states:
+            found = replace(found, state_covariances=_of_states(found, reduced))
+        if clustered:
+            seen, promised = clustered_scatter(linear.observations, linear.poses, found.layout, reduced)
+            found = replace(found, excess=_excess(found, seen - promised))
+        return found
+
+
+def _excess(found: RigCovariance, surplus: Array) -> Array:
+    """The positive part of a surplus of information (k, k), in whitened determined directions (g, g)."""
+    half = found.scale[:, None] * found.directions[:, found.determined]
+    half = half / np.sqrt(found.shares[found.determined])
+    values, vectors = np.linalg.eigh(half.T @ surplus @ half)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _of_states(found: RigCovariance, reduced: ReducedEquations) -> Array:

@@ -228,7 +228,7 @@ def _conclude(
     progress("rig", "checking", 0.8)
     solution = adjusted.solution
     reference = reference_frame(recording, selection, first, config.reference)
-    covariance = covariance_of(solution.problem)
+    covariance = covariance_of(solution.problem, clustered=True)
     statistics = residual_statistics(solution)
     for name, numbers in statistics.items():
         numbers |= {"noise_factor": adjusted.noise_factors[name], "dropped": adjusted.dropped[name]}
