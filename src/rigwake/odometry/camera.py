@@ -19,6 +19,7 @@ from rigwake.odometry.options import OdometryOptions
 from rigwake.odometry.result import OdometryResult
 from rigwake.odometry.seed import SeedOptions, estimate_seed
 from rigwake.odometry.smoother import SmoothedOdometry, smooth
+from rigwake.odometry.turning import estimate_turning
 from rigwake.recording import CameraStream, GnssStream, ImuStream
 from rigwake.tracking.front_ends import track_camera
 from rigwake.tracking.hull import find_hull
@@ -176,13 +177,16 @@ class _Run:
         """Map, then metres."""
         mask, tracks, rotations = self._measured()
         total = len(tracks.timestamps_ns)
-        visual = estimate_monocular(
-            tracks,
-            self.model,
-            self.options.odometry,
-            rotations=rotations,
-            progress=lambda done: self.progress("odometry", min(done, total), total),
-        )
+        try:
+            visual = estimate_monocular(
+                tracks,
+                self.model,
+                self.options.odometry,
+                rotations=rotations,
+                progress=lambda done: self.progress("odometry", min(done, total), total),
+            )
+        except EstimationError as error:
+            return self._turning(mask, tracks, error)
         self._done("odometry")
         start = self._start(visual)
         smoothed = None
@@ -201,6 +205,18 @@ class _Run:
             tuple(self.notes),
             self.seconds,
         )
+
+    def _turning(self, mask: CameraMask, tracks: Tracks, reason: EstimationError) -> CameraOdometry:
+        """Rotations alone, if the camera only turned; else the reason why there is no motion."""
+        try:
+            trajectory = estimate_turning(tracks, self.model, self.options.odometry)
+        except EstimationError:
+            raise reason from None
+        self._done("odometry")
+        self.notes.append(
+            "it stood still or only turned: rotations are measured, positions are not (all zero)"
+        )
+        return CameraOdometry(trajectory, "none", tracks, mask, notes=tuple(self.notes), seconds=self.seconds)
 
     def _start(self, visual: OdometryResult) -> MetricStart | None:
         if self.imu is None and self.gnss is None:

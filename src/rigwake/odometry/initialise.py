@@ -108,7 +108,9 @@ def choose_start(
     tried = [_evaluate(observations, i, j, options, rotations, rng) for _, i, j in pairs]
     best = max(tried, key=lambda pair: pair.score, default=None)
     if best is None or best.score < options.min_inliers:
-        if rotations is not None:  # a camera that is turned towards the IMU otherwise than thought misleads them
+        if (
+            rotations is not None
+        ):  # a camera that is turned towards the IMU otherwise than thought misleads them
             return choose_start(observations, first, last, options, rng)
         raise EstimationError(
             f"{observations.tracks.camera}: no two frames between {first} and {last} see enough of the same points "

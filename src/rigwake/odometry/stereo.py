@@ -158,7 +158,7 @@ def _chain(visual_map: VisualMap, matches: StereoMatches, second_from_first: SE3
 
 
 def _add_points(visual_map: VisualMap, matches: StereoMatches, second_from_first: SE3, frame: int) -> None:
-    """Points of the tracks that this frame sees in both cameras and that have none yet, where the disparity fixes one."""
+    """Points of the tracks that this frame sees in both cameras, have none yet, and whose disparity fixes one."""
     observations = visual_map.observations
     rows = np.arange(*observations.of_frame(frame).indices(len(observations.frame)))
     rows = rows[np.isfinite(matches.angle[rows]) & np.isfinite(matches.bearings_cam[rows]).all(axis=1)]
