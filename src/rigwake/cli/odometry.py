@@ -37,6 +37,10 @@ def command(
         bool,
         typer.Option("--horizon/--no-horizon", help="Leave out what lies below the horizon (with an IMU)."),
     ] = True,
+    loops: Annotated[
+        bool,
+        typer.Option("--loops", help="Recognise places seen before, also where the odometry did not break."),
+    ] = False,
     mask: Annotated[Path | None, typer.Option(help="Picture, white where the camera may be used.")] = None,
     seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
     topic: TopicOption = (),
@@ -67,6 +71,7 @@ def command(
         hull=hull,
         horizon=horizon,
         mask_file=mask,
+        loops=loops,
     )
     streams = list(opened.cameras.values()) if camera == "all" else [opened.camera(camera)]
     sensors = _first(opened.imus) if imu else None, _first(opened.gnss) if gnss else None

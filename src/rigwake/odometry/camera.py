@@ -13,6 +13,7 @@ import numpy as np
 from rigwake.errors import EstimationError, UnobservableError, UsageError
 from rigwake.geometry.so3 import Array
 from rigwake.odometry.gyro import GyroAlignment, align_gyro, camera_rotations, up_in_camera
+from rigwake.odometry.loop_closure import find_loops, joined_tracks
 from rigwake.odometry.metric import MetricStart, metric_start
 from rigwake.odometry.monocular import estimate_monocular
 from rigwake.odometry.options import OdometryOptions
@@ -40,6 +41,7 @@ class CameraOdometryOptions:
     method: `adjusted` (keyframes, bundle adjustment, smoother) or `seed` (the frame-to-frame baseline).
     hull: look for the own boat in view. horizon: leave out what lies below the horizon (needs an IMU).
     mask_file: picture of the camera's size, white where it may be used.
+    loops: recognise places seen before and join their tracks; without it this is done only where the odometry broke.
     """
 
     method: Method = "adjusted"
@@ -49,6 +51,7 @@ class CameraOdometryOptions:
     hull: bool = True
     horizon: bool = True
     mask_file: Path | None = None
+    loops: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,17 +179,12 @@ class _Run:
     def adjusted(self) -> CameraOdometry:
         """Map, then metres."""
         mask, tracks, rotations = self._measured()
-        total = len(tracks.timestamps_ns)
         try:
-            visual = estimate_monocular(
-                tracks,
-                self.model,
-                self.options.odometry,
-                rotations=rotations,
-                progress=lambda done: self.progress("odometry", min(done, total), total),
-            )
+            visual = self._visual(tracks, rotations)
         except EstimationError as error:
             return self._turning(mask, tracks, error)
+        if self.options.loops or visual.counts.segments > 1:
+            tracks, visual = self._closed(tracks, visual, rotations)
         self._done("odometry")
         start = self._start(visual)
         smoothed = None
@@ -205,6 +203,32 @@ class _Run:
             tuple(self.notes),
             self.seconds,
         )
+
+    def _visual(self, tracks: Tracks, rotations: Array | None) -> OdometryResult:
+        total = len(tracks.timestamps_ns)
+        return estimate_monocular(
+            tracks,
+            self.model,
+            self.options.odometry,
+            rotations=rotations,
+            progress=lambda done: self.progress("odometry", min(done, total), total),
+        )
+
+    def _closed(
+        self, tracks: Tracks, visual: OdometryResult, rotations: Array | None
+    ) -> tuple[Tracks, OdometryResult]:
+        """Once more with the tracks of recognised places joined, if there are any."""
+        self.progress("recognising places", 0, 1)
+        loops = find_loops(self.stream, tracks, self.model, visual)
+        if not len(loops.frames):
+            return tracks, visual
+        joined = joined_tracks(tracks, loops.track_ids)
+        again = self._visual(joined, rotations)
+        self.notes.append(
+            f"{len(loops.frames)} pairs of frames show a place again: {visual.counts.segments} segments became "
+            f"{again.counts.segments}"
+        )
+        return joined, again
 
     def _turning(self, mask: CameraMask, tracks: Tracks, reason: EstimationError) -> CameraOdometry:
         """Rotations alone, if the camera only turned; else the reason why there is no motion."""
