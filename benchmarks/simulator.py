@@ -51,14 +51,13 @@ def rendering(simulation: Simulation, shots: list[Shot]) -> None:
         renderer.render(shot.view, shot.row_poses(float(times[index])), seas[index])
 
     def take(index: int) -> None:
-        camera = shots[index % len(shots)]
-        camera.take(index, float(times[index]), renderer.water(float(times[index])))
+        shots[index % len(shots)].take(index, float(times[index]), renderer.water(float(times[index])))
 
     render(0)
+    camera = shot.camera
     cast_s, shaded_s, whole_s = both_cores(cast), both_cores(render), both_cores(take)
-    print(
-        f"\n| 640x480, 4 rays per pixel, {len(rays) / 1e6:.2f} M rays | wall, {WORKERS} threads | CPU | / bare |"
-    )
+    what = f"{camera.width_px}x{camera.height_px}, 4 rays per pixel, {len(rays) / 1e6:.2f} M rays"
+    print(f"\n| {what} | wall, {WORKERS} threads | CPU | / bare |")
     print("|---|---|---|---|")
     for name, (wall, cpu) in (
         ("bare ray casting of the same rays", cast_s),
@@ -67,7 +66,9 @@ def rendering(simulation: Simulation, shots: list[Shot]) -> None:
     ):
         print(f"| {name} | {wall:.3f} s | {cpu:.3f} s | {cpu / cast_s[1]:.2f} |")
     frames = sum(len(s.stamps) for s in shots)
-    print(f"\nThe demo has {frames} frames: {frames * whole_s[0]:.0f} s on {WORKERS} threads.")
+    print(
+        f"\n`{simulation.scenario.name}` has {frames} frames: {frames * whole_s[0]:.0f} s on {WORKERS} threads."
+    )
 
 
 def corners() -> None:
@@ -116,15 +117,20 @@ def tracks_only() -> None:
     )
 
 
-def main() -> None:
-    tracks_only()
-    simulation = prepare(load_scenario("demo"))
+def world(preset: str) -> tuple[Simulation, list[Shot]]:
+    simulation = prepare(load_scenario(preset))
     before = time.process_time()
     scenery, renderer = build_world(simulation)
-    print(f"\nScene: {len(scenery.mesh)} triangles, built in {time.process_time() - before:.1f} CPU-s.")
-    shots = [Shot.prepare(simulation, renderer, i) for i in range(4)]
-    rendering(simulation, shots)
-    motion(simulation, shots)
+    print(f"\n`{preset}`: {len(scenery.mesh)} triangles, built in {time.process_time() - before:.1f} CPU-s.")
+    return simulation, [Shot.prepare(simulation, renderer, i) for i in range(4)]
+
+
+def main() -> None:
+    tracks_only()
+    rendering(*world("thesis_lively"))
+    demo = world("demo")
+    rendering(*demo)
+    motion(*demo)
     corners()
     print(f"\nPeak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB, limit 2 GB.")
 

@@ -37,6 +37,7 @@ def small(**changes: object) -> Scenario:
     return build_scenario(plain)
 
 
+@pytest.mark.slow
 def test_textures_keep_their_mean_colour_at_any_distance() -> None:
     atlas = build_atlas(3, contrast=1.0)
     for number in range(len(atlas.names)):
@@ -245,7 +246,7 @@ def test_the_command_writes_a_recording_with_its_truth(tmp_path: Path, name: str
 def test_a_rolling_shutter_shows_later_rows_later() -> None:
     """Every row of a rolling-shutter picture equals that row of an instant picture taken at the row's own time."""
     plain = small().model_dump()
-    plain["cameras"][0] |= {"rolling_shutter_ms": 60.0}
+    plain["cameras"] = [plain["cameras"][0] | {"rolling_shutter_ms": 60.0}]
     simulation = prepare(build_scenario(plain))
     _, renderer = build_world(simulation)
     shot = Shot.prepare(simulation, renderer, 0)

@@ -32,7 +32,7 @@ _SPACING_PX = 58
 _WINDOW_PX = 6
 _BLUR_PX = 0.5
 _CAMERA_HEIGHT_M = 300.0
-_IDEAL_SAMPLES = 12  # per pixel and direction
+_IDEAL_SAMPLES = 8  # per pixel and direction
 _BLACK, _WHITE = 0.027, 0.9  # of the chequered texture
 _OUT_OF_SIGHT = Hull(
     (Tube((0, 0, -2000), (0, 0, -2001), 0.1, 0.1, (1, 1, 1)),), HullResponse(1, 1, (1, 1, 1), (1, 1, 1))
@@ -125,7 +125,7 @@ def _detect(grey: Floats, near: Array) -> Array:
 
 def _ideal_corner(model: CameraModel, boards: _Boards, i: int) -> Array:
     """The corner of board i in a patch whose every pixel averages exact ray-plane intersections."""
-    reach = 2 * _WINDOW_PX + 3
+    reach = _WINDOW_PX + 6
     origin = np.round(boards.pixels[i]) - reach
     size = 2 * reach + 1
     fine = (np.arange(size * _IDEAL_SAMPLES) + 0.5) / _IDEAL_SAMPLES - 0.5

@@ -201,9 +201,9 @@ def water_distance(
         return np.inf
     t = -oz / dz
     seen = width * t / math.sqrt(max(-dz, 0.04))
-    octave = math.log2(max(seen, 1e-6)) + 8.5
-    level0 = int(min(max(octave - water.octaves[0], 0.0), 7.0))
-    level1 = int(min(max(octave - water.octaves[1], 0.0), 7.0))
+    level0 = _nearest_level(water, 0, seen)
+    level1 = _nearest_level(water, 1, seen)
+    close_enough = max(1e-3, 0.5 * seen)  # along the ray: the next step would be far smaller still
     for _ in range(3):
         x, y = ox + t * dx, oy + t * dy
         h0, sx0, sy0 = _tile(water, 0, level0, x, y)
@@ -211,9 +211,24 @@ def water_distance(
         closing = min(dz - (sx0 + sx1) * dx - (sy0 + sy1) * dy, 0.4 * dz)
         step = (oz + t * dz - h0 - h1) / closing
         t = min(max(t - step, first), last)
-        if abs(step) < 1e-3:
+        if abs(step) < close_enough:
             break
     return t
+
+
+@_inlined
+def _nearest_level(water: Water, tile: int, width_m: float) -> int:
+    cell = water.lengths[tile] / 256
+    if width_m < 1.42 * cell:
+        return 0
+    return int(min(math.log2(width_m / cell) + 0.5, 7.0))
+
+
+@_inlined
+def _clear_air(distance_m: float) -> float:
+    """Share of light that haze lets through: `exp(-x)` to third order, which is cheaper."""
+    x = distance_m / _HAZE_M
+    return 1 / (1 + x * (1 + x * (0.5 + x / 6)))
 
 
 @_inlined
@@ -256,11 +271,12 @@ def _mirror(
     length = math.sqrt(nx * nx + ny * ny + 1)
     nx, ny, nz = nx / length, ny / length, nz / length
     facing = max(-(nx * dx + ny * dy + nz * dz), 0.015)
-    fresnel = 0.02 + 0.98 * (1 - facing) ** (5 * math.exp(-2.69 * rough)) / (1 + 22.7 * rough**1.5)
+    steep = 1 + rough * (2.69 + rough * (3.62 + 3.24 * rough))  # exp(2.69 rough)
+    fresnel = 0.02 + 0.98 * (1 - facing) ** (5 / steep) / (1 + 22.7 * rough * math.sqrt(rough))
     rx, ry, rz = dx + 2 * facing * nx, dy + 2 * facing * ny, max(dz + 2 * facing * nz, 0.012)
     length = math.sqrt(rx * rx + ry * ry + rz * rz)
     rx, ry, rz = rx / length, ry / length, rz / length
-    haze = math.exp(-t / _HAZE_M)
+    haze = _clear_air(t)
     # light scattered back by the water itself, a little more of it through tilted faces
     body = (1 - fresnel) * (0.75 + 1.6 * max(sx * dx + sy * dy, -0.3)) * haze
     pixel = rays.pixel[i]
@@ -270,7 +286,7 @@ def _mirror(
     hx, hy, hz = s.sun[0] - dx, s.sun[1] - dy, s.sun[2] - dz
     miss = (hx / hz + sx) ** 2 + (hy / hz + sy) ** 2
     variance = lost + 2e-4  # and the width of the sun itself
-    density = math.exp(-0.5 * miss / variance) / (2 * math.pi * variance)
+    density = math.exp(-0.5 * miss / variance) / (2 * math.pi * variance) if miss < 60 * variance else 0.0
     out.glint[k] = min(fresnel * SUN_IRRADIANCE * density / (4 * facing), 6.0) * haze
     out.origin[k, 0], out.origin[k, 1], out.origin[k, 2] = x, y, rays.origin[i, 2] + t * dz + 0.02
     out.direction[k, 0], out.direction[k, 1], out.direction[k, 2] = rx, ry, rz
@@ -311,7 +327,7 @@ def shade(s: Surfaces, water: Water, rays: Rays, out: Mirrored, image: Floats) -
                 cosine,
                 rays.width[i] * t,
             )
-            haze = math.exp(-t / _HAZE_M)
+            haze = _clear_air(t)
             r, g, b = (
                 r * haze + (1 - haze) * s.horizon[0],
                 g * haze + (1 - haze) * s.horizon[1],
