@@ -192,8 +192,15 @@ def test_sigmas_of_the_inverse_are_those_of_a_monte_carlo() -> None:
         ({}, "good", "agree within 1.1 σ"),
         ({"hand_over": {"count": 9, "median_px": 7.5}}, "usable", "7.5 px off"),
         ({"hand_over": {"count": 0}}, "usable", "No landmark went"),
+        (
+            {"hand_over": {"count": 9, "median_px": 0.5, "by_pair": {"aft->aft": {"count": 9}}}},
+            "usable",
+            "No landmark went",
+        ),
         ({"split_half": {"port": {"sigmas": 8.0}}}, "usable", "disagree by 8.0 σ for port"),
         ({"split_half": None}, "usable", "were not compared"),
+        ({"failed_cameras": {"mast": "too few points"}}, "usable", "mast could not be calibrated"),
+        ({"converged": False}, "usable", "did not settle"),
     ],
 )
 def test_the_verdict_rests_on_checks(change: dict, level: str, words: str) -> None:

@@ -37,7 +37,7 @@ def command(
     content = load_report_content(folder)
     path = build_report(content)
     for line in summary_lines(content.calibration):
-        out.print(line, markup=False, highlight=False)
+        out.print(line, markup=False, highlight=False, soft_wrap=True)
     out.print(f"\n{path}: {path.stat().st_size / 1e6:.1f} MB", markup=False, highlight=False)
     if figures is not None:
         from rigwake.report.figures import write_figures

@@ -24,6 +24,7 @@ from rigwake.trajectory import Trajectory
 
 RIG_TRAJECTORY = "rig"
 _MASK_WIDTH_PX = 400
+_MASK_VALUES = {"hull": 2, "water": 3, "sky": 4}
 _LARGEST_JSON_BYTES = 50 * 1024 * 1024
 Loaded = TypeVar("Loaded")
 
@@ -57,7 +58,7 @@ class Picture:
 class ReportContent:
     """Everything that the report shows. `absent` says per panel why it has nothing to show.
 
-    masks: per camera an (h, w) uint8 image: 0 used, 1 excluded, 2 hull, 3 water.
+    masks: per camera an (h, w) uint8 image: 0 used, 1 excluded, 2 hull, 3 water, 4 sky.
     """
 
     folder: Path
@@ -149,21 +150,19 @@ def _read_residuals(path: Path, lenses: Mapping[str, CameraModel | None]) -> dic
 
 
 def _read_masks(folder: Path) -> dict[str, np.ndarray]:
-    masks = {}
     files = {file.stem: file for file in sorted(folder.glob("*.png"))}
-    regions = (("_hull", 2), ("_water", 3))
-    for name, file in files.items():
-        if any(name.endswith(suffix) and name.removesuffix(suffix) in files for suffix, _ in regions):
-            continue
-        mask = np.where(_image(file) > 127, 0, 1).astype(np.uint8)
-        for suffix, value in regions:
-            if name + suffix in files:
-                region = _image(files[name + suffix])
-                if region.shape == mask.shape:
-                    mask[(region > 127) & (mask > 0)] = value
+    parts = {name: base for name in files for base in files if name.startswith(f"{base}_")}
+    masks = {}
+    for name in files.keys() - parts.keys():
+        mask = np.where(_image(files[name]) > 127, 0, 1).astype(np.uint8)
+        for part in (part for part, base in parts.items() if base == name):
+            region = _image(files[part])
+            value = _MASK_VALUES.get(part.removeprefix(f"{name}_"), 1)
+            if region.shape == mask.shape:
+                mask[(region > 127) & (mask > 0)] = value
         height = max(1, round(mask.shape[0] * _MASK_WIDTH_PX / mask.shape[1]))
         masks[name] = cv2.resize(mask, (_MASK_WIDTH_PX, height), interpolation=cv2.INTER_NEAREST)
-    return masks
+    return dict(sorted(masks.items()))
 
 
 def _image(file: Path) -> np.ndarray:

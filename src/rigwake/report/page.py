@@ -61,7 +61,8 @@ def _environment() -> jinja2.Environment:
 
 def _values(content: ReportContent) -> dict[str, Any]:
     calibration = content.calibration
-    colours = {name: index for index, name in enumerate(calibration.cameras)}
+    names = dict.fromkeys([*calibration.cameras, *content.tracks, *content.masks])  # also those given up
+    colours = {name: index for index, name in enumerate(names)}
     paths = paths_in_one_world(content.trajectories, RIG_TRAJECTORY)
     rig = content.trajectories.get(RIG_TRAJECTORY)
     motion = motion_of(rig) if rig is not None else None

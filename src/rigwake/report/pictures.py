@@ -14,9 +14,9 @@ from rigwake.report.content import OverlayPoint, Picture
 BUDGET_BYTES = 8_000_000
 _WIDTHS_PX = (960, 720, 540, 400, 300)
 _QUALITY = 78
-# unused grey, hull orange, water blue: BGRA
+# unused grey, hull orange, water blue, sky light blue: BGRA
 _MASK_COLOURS = np.array(
-    [[0, 0, 0, 0], [120, 120, 120, 150], [0, 94, 213, 170], [178, 114, 0, 170]], np.uint8
+    [[0, 0, 0, 0], [120, 120, 120, 150], [0, 94, 213, 170], [178, 114, 0, 170], [233, 180, 86, 130]], np.uint8
 )
 
 
@@ -74,8 +74,10 @@ def _jpeg_within(image: np.ndarray, share_bytes: int) -> bytes:
 
 
 def mask_uri(mask: np.ndarray) -> str:
-    """A mask (0 used, 1 excluded, 2 hull, 3 water) as a transparent PNG."""
-    return _uri(cv2.imencode(".png", _MASK_COLOURS[np.minimum(mask, 3)])[1].tobytes(), "png")
+    """A mask (values as in `ReportContent`) as a transparent PNG."""
+    return _uri(
+        cv2.imencode(".png", _MASK_COLOURS[np.minimum(mask, len(_MASK_COLOURS) - 1)])[1].tobytes(), "png"
+    )
 
 
 def _uri(content: bytes, kind: str) -> str:

@@ -39,7 +39,7 @@ class Verdict:
 
 _SENTENCES: dict[Level, str] = {
     "good": "Every camera is determined, precisely, and independent checks agree.",
-    "usable": "Every camera is determined, but not everything that was asked of it holds.",
+    "usable": "What is given here is determined, but not everything that was asked of it holds.",
     "not determined": "The motion in this recording does not fix every camera.",
 }
 
@@ -49,6 +49,7 @@ def judge(calibration: Calibration) -> Verdict:
     lost = _undetermined(calibration)
     reasons = [
         *lost,
+        *_estimation(calibration.checks),
         *_precision(calibration),
         _split_half(calibration.checks),
         _hand_over(calibration.checks),
@@ -63,6 +64,22 @@ def _undetermined(calibration: Calibration) -> list[Reason]:
         for camera in calibration.cameras.values()
         for direction in camera.undetermined
     ]
+
+
+def _estimation(checks: Mapping[str, Any]) -> list[Reason]:
+    """Cameras that were given up, and an adjustment that did not settle."""
+    failed = checks.get("failed_cameras")
+    reasons = [
+        Reason(False, f"{name} could not be calibrated.", str(why))
+        for name, why in (failed.items() if isinstance(failed, Mapping) else ())
+    ]
+    if checks.get("converged") is False:
+        reasons.append(
+            Reason(
+                False, "The adjustment did not settle.", "Look at the residuals over time and at the masks."
+            )
+        )
+    return reasons
 
 
 def _sentence(words: str) -> str:
@@ -140,16 +157,19 @@ def _split_half(checks: Mapping[str, Any]) -> Reason:
 
 
 def _hand_over(checks: Mapping[str, Any]) -> Reason:
-    """Landmarks of one camera, predicted into another that was not used for them."""
-    median = _number(checks.get("hand_over"), "median_px")
-    count = _number(checks.get("hand_over"), "count") or 0
-    if median is None or count == 0:
+    """Landmarks predicted into images, of other cameras too, that were not used for them."""
+    hand_over = checks.get("hand_over")
+    median = _number(hand_over, "median_px")
+    count = _number(hand_over, "count") or 0
+    if median is None or count == 0 or not _between_cameras(hand_over):
         return Reason(
             False,
             "No landmark went from one camera to another, so the cameras could not be checked against each other.",
             "Turn through at least 360 degrees near structures on shore.",
         )
-    words = f"{count:.0f} landmarks predicted from one camera into another land {median:.2g} px off (median)"
+    words = (
+        f"{count:.0f} landmarks, predicted into images not used for them, land {median:.2g} px off (median)"
+    )
     if median <= GOOD_HAND_OVER_PX:
         return Reason(True, f"{words}.")
     return Reason(
@@ -157,3 +177,11 @@ def _hand_over(checks: Mapping[str, Any]) -> Reason:
         f"{words}; good means at most {GOOD_HAND_OVER_PX:g} px.",
         "Look at the hand-over pictures: one camera off in all of them points to its lens or its mount.",
     )
+
+
+def _between_cameras(hand_over: Any) -> bool:
+    """Whether a pair `a->b` is of two cameras; a landmark seen again by the same one says nothing about the rig."""
+    pairs = hand_over.get("by_pair") if isinstance(hand_over, Mapping) else None
+    if not isinstance(pairs, Mapping):
+        return True  # the file does not tell pairs apart
+    return any(first != second for first, _, second in (str(pair).partition("->") for pair in pairs))
