@@ -98,7 +98,7 @@ def command(
             out.print(f"[red]{name} is not calibrated:[/red] {reason}")
         for note in run.notes:
             out.print(f"[dim]note: {note}[/dim]")
-        out.print(f"written: {run.out / 'calibration.yaml'}")
+        out.print(f"written: {run.out / 'calibration.yaml'}, {run.out / 'report.html'}", soft_wrap=True)
         next_step(f"rigwake report {run.out} --open", "look at it before you believe it")
 
 

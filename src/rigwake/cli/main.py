@@ -26,6 +26,7 @@ VERBS: tuple[str, ...] = (
     "export",
     "report",
     "simulate",
+    "demo",
 )
 
 

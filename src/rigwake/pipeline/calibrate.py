@@ -44,6 +44,7 @@ from rigwake.readers.open import open_recording
 from rigwake.readers.topics import TopicMap
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.recording import Recording
+from rigwake.report import build_report, load_report_content
 from rigwake.tracks import load_tracks
 from rigwake.trajectory import Trajectory
 
@@ -105,6 +106,8 @@ def calibrate(
         provenance=_provenance(Path(recording), config, first),
     )
     write_outputs(out, calibration, adjusted, first, selection, handed_over)
+    progress("rig", "writing the report", 0.95)
+    build_report(load_report_content(out))
     return CalibrationRun(calibration, out, failed, notes)
 
 

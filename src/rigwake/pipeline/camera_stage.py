@@ -20,7 +20,7 @@ from rigwake.odometry.monocular import estimate_monocular
 from rigwake.recording import CameraStream, ImuStream
 from rigwake.tracking.front_ends import track_camera
 from rigwake.tracking.hull import find_hull
-from rigwake.tracking.masks import CameraMask, beyond_lens
+from rigwake.tracking.masks import CameraMask, lens_mask
 from rigwake.tracking.turns import visual_turns
 from rigwake.writers.trajectories import write_tum
 
@@ -124,13 +124,11 @@ def _process(job: CameraJob, tell: Tell) -> CameraOutcome:
 def _mask(job: CameraJob, notes: list[str], tell: Tell) -> CameraMask:
     """Lens border and own hull; saved as pictures."""
     stream = job.stream
-    assert stream.model is not None
     tell("looking for the hull", 0.0)
-    border = beyond_lens(stream.model)
-    mask = CameraMask(stream.width_px, stream.height_px, {"lens": border})
+    mask = lens_mask(stream)
     if job.config.find_hull:
         try:
-            mask = mask.with_region("hull", find_hull(stream, ~border))
+            mask = mask.with_region("hull", find_hull(stream, mask.usable))
         except RigwakeError as error:
             notes.append(f"hull not masked: {error.cause}")
     mask.save(job.out / "masks", stream.name)

@@ -1,0 +1,33 @@
+"""`rigwake demo`: simulate, calibrate, evaluate and report, out of the box."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rigwake.cli.console import next_step, out
+
+
+def command(
+    folder: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder for the recording and the result.")
+    ] = Path("demo"),
+) -> None:
+    """Simulate a harbour recording, calibrate it, compare with the truth and write the report.
+
+    The recording is kept: a second run calibrates it again. Example: [cyan]rigwake demo -o demo[/cyan]
+    """
+    from rigwake.cli import calibrate, evaluate, report, simulate
+
+    recording, result = folder / "harbour.bag", folder / "result"
+    if recording.exists():
+        out.print(f"{recording} is there already: not simulated again.")
+    else:
+        folder.mkdir(parents=True, exist_ok=True)
+        simulate.command("demo", output=recording)
+    calibrate.command(recording, result)
+    evaluate.command(result / "calibration.yaml", folder / "harbour_truth" / "truth.yaml")
+    report.command(result)
+    next_step(f"open {result / 'report.html'}", "then calibrate your own: rigwake calibrate REC -o OUT")
