@@ -153,6 +153,9 @@ def _in_process(
     stream: CameraStream, imu: Any, gnss: Any, options: CameraOdometryOptions, queue: Any
 ) -> tuple[CameraOdometry | None, tuple[str, str, str, int] | None]:
     """One camera; an error travels between processes as its words, since exceptions pickle only their message."""
+    import cv2
+
+    cv2.setNumThreads(1)  # the processes share the processors already
     result = _attempt(stream, imu, gnss, options, lambda *state: queue.put((stream.name, *state)))
     if isinstance(result, RigwakeError):
         return None, (result.cause, result.consequence, result.remedy, result.exit_code)

@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from rigwake.errors import EstimationError, UnobservableError, UsageError
 from rigwake.geometry.so3 import Array
-from rigwake.odometry.gyro import GyroAlignment, align_gyro, camera_rotations, up_in_camera
+from rigwake.odometry.gyro import GyroAlignment, align_gyro, camera_rotations
+from rigwake.odometry.level import up_in_camera
 from rigwake.odometry.loop_closure import find_loops, joined_tracks
 from rigwake.odometry.metric import MetricStart, metric_start
 from rigwake.odometry.monocular import estimate_monocular
@@ -252,10 +251,3 @@ class _Run:
             return None
         self.notes += start.notes
         return start
-
-
-def scene_share(mask: Array, tracks: Tracks) -> float:
-    """Share of a camera's observations that fall on `mask` (H, W), True where they should not be."""
-    at = np.rint(tracks.pixels).astype(np.int64)
-    inside = (at >= 0).all(axis=1) & (at[:, 0] < mask.shape[1]) & (at[:, 1] < mask.shape[0])
-    return float(mask[at[inside, 1], at[inside, 0]].mean()) if inside.any() else 0.0

@@ -179,25 +179,3 @@ def camera_rotations(imu: ImuStream, alignment: GyroAlignment, timestamps_ns: St
     return np.asarray(
         turned.at(timestamps_ns + round(alignment.time_offset_s * 1e9)) @ alignment.imu_from_cam
     )
-
-
-def up_in_camera(
-    imu: ImuStream, alignment: GyroAlignment, timestamps_ns: Stamps, *, window_s: float = 20.0
-) -> Array:
-    """(F, 3) unit vectors against gravity in camera axes, at camera stamps.
-
-    The specific force, turned into a frame that the gyro holds still, averaged over a window of this length: waves
-    and turns cancel, the gyro's drift does not show yet.
-    """
-    turned = integrate_gyro(imu, alignment.gyro_bias)
-    force = np.einsum("nij,nj->ni", turned.rotation, imu.accel)
-    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(force, axis=0)])
-    at_ns = timestamps_ns + round(alignment.time_offset_s * 1e9)
-    half = round(window_s * 0.5e9)
-    first = np.searchsorted(imu.timestamps_ns, at_ns - half)
-    last = np.maximum(np.searchsorted(imu.timestamps_ns, at_ns + half, side="right"), first + 1)
-    first = np.minimum(first, len(force) - 1)
-    last = np.minimum(last, len(force))
-    up = sums[last] - sums[first]
-    up_cam = np.einsum("nji,nj->ni", turned.at(at_ns) @ alignment.imu_from_cam, up)
-    return np.asarray(up_cam / np.linalg.norm(up_cam, axis=1, keepdims=True))
