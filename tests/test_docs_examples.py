@@ -2,6 +2,7 @@
 
 import ast
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -55,3 +56,17 @@ def test_messages_in_the_faq_are_messages_of_the_program() -> None:
         assert fragments, message
         for fragment in fragments:
             assert fragment.strip() in known, message
+
+
+def test_the_example_exports_what_the_formats_can_hold(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_calibration(boat(), tmp_path / "calibration.yaml")
+    monkeypatch.setattr(
+        "sys.argv", ["export_everywhere.py", str(tmp_path / "calibration.yaml"), str(tmp_path / "out")]
+    )
+    runpy.run_path(str(ROOT / "examples" / "export_everywhere.py"), run_name="__main__")
+    said = capsys.readouterr().out
+    refused = {line.split()[0] for line in said.splitlines() if " refused: " in line}
+    assert refused == {"basalt", "mrcal"}  # noise of the IMU is missing; no fisheye
+    assert len(list((tmp_path / "out").iterdir())) == 9

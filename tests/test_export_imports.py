@@ -161,6 +161,18 @@ def test_a_fisheye_is_not_cut_down_to_a_pinhole(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_refusal_leaves_nothing_and_old_files_are_named(tmp_path: Path) -> None:
+    mixed = {"a": camera("a", SE3.identity(), PINHOLE), "b": camera("b", SE3.identity(), FISHEYE)}
+    with pytest.raises(CameraError):
+        export_calibration(Calibration("imu", mixed), "mrcal", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    export_calibration(boat(), "opencv", tmp_path)
+    (note,) = export_calibration(
+        without_vertical(boat(), "aft"), "opencv", tmp_path, allow_undetermined=True
+    )[1:]
+    assert "aft.yaml was there before" in note
+
+
 def test_colmap_warns_of_its_fisheye(tmp_path: Path) -> None:
     wide = camera_from_params("kb4", FISHEYE.params, 640, 480, np.deg2rad(95))
     notes = export_calibration(boat("front", lens=wide), "colmap", tmp_path)
@@ -213,6 +225,9 @@ GOOD_URDF = '<robot name="r"><link name="a"/>{}</robot>'
         ("a.yaml", "a: [1, 2", "cannot be read as YAML"),
         ("a.yaml", "!!python/object/apply:os.system ['true']", "cannot be read as YAML"),
         ("a.json", "{", "not JSON"),
+        ("a.json", "[" * 100_000, "not JSON"),
+        ("a.yaml", "[" * 5000, "cannot be read as YAML"),
+        ("a.csv", "camera\n" + "x" * 200_000, "not a table"),
         ("a.json", '{"value0": {}}', "not a Basalt"),
         ("a.json", "[]", "not a rig config"),
         ("a.json", "{}", "not a rigwake calibration"),

@@ -25,7 +25,7 @@ from rigwake.exporters.base import (
     Notes,
     foreign_calibration,
     foreign_camera,
-    read_text,
+    read_json_file,
     require_lenses,
     require_reference,
     transform_from_parts,
@@ -96,7 +96,7 @@ def _common_offset(calibration: Calibration) -> tuple[float, Notes]:
 def read_basalt(path: Path) -> Calibration:
     """The cameras of a Basalt calibration, named cam0, cam1, ..."""
     try:
-        content = json.loads(read_text(path))["value0"]
+        content = read_json_file(path)["value0"]
         poses, lenses, sizes = content["T_imu_cam"], content["intrinsics"], content["resolution"]
         offset_s = float(content.get("cam_time_offset_ns", 0)) * 1e-9
         cameras = [
@@ -112,7 +112,7 @@ def read_basalt(path: Path) -> Calibration:
             )
             for number, (pose, lens, size) in enumerate(zip(poses, lenses, sizes, strict=True))
         ]
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path} is not a Basalt calibration: {type(error).__name__}: {error}.") from error
     return foreign_calibration(IMU, cameras, path)
 

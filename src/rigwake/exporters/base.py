@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
 from rigwake import __version__
+from rigwake.atomic import write_text_atomic
 from rigwake.calibration import CalibratedCamera, Calibration, UndeterminedDirection
 from rigwake.calibration.values import AXIS_NAMES
 from rigwake.cameras.base import CameraModel
-from rigwake.errors import InputError, UnobservableError, UsageError
+from rigwake.cameras.opencv_yaml import load_yaml
+from rigwake.errors import CameraError, InputError, UnobservableError, UsageError
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array, nearest_rotation
 
@@ -224,6 +228,18 @@ def yaml_text(content: object, comments: Iterable[str], first_line: str = "") ->
     return "\n".join([*lead, *(f"# {line}" for line in comments), body])
 
 
+def write_files(files: Mapping[Path, str]) -> Notes:
+    """Write several files, once all of them exist as text, so that a refusal leaves nothing behind.
+
+    Notes name files of the same kind in these folders that are not part of what is written.
+    """
+    for path, text in files.items():
+        write_text_atomic(path, text)
+    kinds = {(path.parent, path.suffix) for path in files}
+    strangers = sorted(f for folder, suffix in kinds for f in folder.glob(f"*{suffix}") if f not in files)
+    return [f"{file} was there before and is not part of this calibration" for file in strangers]
+
+
 def read_text(path: Path) -> str:
     """The text of a small file; InputError if it cannot be read or is larger than any calibration."""
     try:
@@ -234,6 +250,22 @@ def read_text(path: Path) -> str:
         raise InputError(f"There is no file {path}.") from error
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is not a readable text file: {error}.") from error
+
+
+def read_json_file(path: Path) -> Any:
+    """The content of a JSON file; InputError if it is none."""
+    try:
+        return json.loads(read_text(path))
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{path} is not JSON: {error}.") from error
+
+
+def read_yaml_file(path: Path) -> Any:
+    """The content of a YAML file, with OpenCV's header or without; InputError if it is none."""
+    try:
+        return load_yaml(read_text(path))
+    except (CameraError, RecursionError) as error:
+        raise InputError(f"{path} cannot be read as YAML: {error}") from error
 
 
 _LARGEST_BYTES = 100 * 1024 * 1024  # mrcal keeps its optimisation inputs in the file

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rigwake.atomic import write_text_atomic
 from rigwake.calibration import Calibration
 from rigwake.cameras.base import CameraModel
-from rigwake.cameras.opencv_yaml import camera_from_camodocal, camera_to_camodocal, load_yaml
+from rigwake.cameras.opencv_yaml import camera_from_camodocal, camera_to_camodocal
 from rigwake.errors import InputError
 from rigwake.exporters.base import (
     ODOMETRY,
@@ -21,7 +20,9 @@ from rigwake.exporters.base import (
     foreign_calibration,
     foreign_camera,
     read_text,
+    read_yaml_file,
     transform_from_matrix,
+    write_files,
 )
 from rigwake.exporters.lenses import write_lens
 
@@ -33,6 +34,7 @@ def write_camodocal(calibration: Calibration, path: Path, options: ExportOptions
     """The folder; cameras without a lens get no `NAME_calib.yaml`."""
     more: Notes = []
     lines: list[str] = []
+    files: dict[Path, str] = {}
     for name, camera in calibration.cameras.items():
         if camera.model is not None:
             text, _, lens_notes = write_lens(
@@ -42,12 +44,12 @@ def write_camodocal(calibration: Calibration, path: Path, options: ExportOptions
                 options.max_fit_error_px,
                 name,
             )
-            write_text_atomic(path / _file_name(name), text)
+            files[path / _file_name(name)] = text
             more += lens_notes
         matrix = camera.rig_from_cam.matrix[:3]
         lines += [name, *(" ".join(repr(float(x)) for x in row) for row in matrix), ""]
-    write_text_atomic(path / EXTRINSICS, "\n".join(lines) + "\n")
-    return [*more, f"camera to {calibration.reference}, which CamOdoCal calls odometry"]
+    files[path / EXTRINSICS] = "\n".join(lines) + "\n"
+    return [*more, *write_files(files), f"camera to {calibration.reference}, which CamOdoCal calls odometry"]
 
 
 def read_camodocal(path: Path) -> Calibration:
@@ -74,4 +76,4 @@ def _file_name(camera: str) -> str:
 
 def _lens(folder: Path, name: str) -> CameraModel | None:
     file = folder / _file_name(name)
-    return camera_from_camodocal(load_yaml(read_text(file))) if file.is_file() else None
+    return camera_from_camodocal(read_yaml_file(file)) if file.is_file() else None

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from rigwake.calibration import Calibration, load_calibration
-from rigwake.cameras.opencv_yaml import load_yaml
-from rigwake.errors import CameraError, InputError, UsageError
+from rigwake.errors import InputError, UsageError
 from rigwake.exporters.basalt import read_basalt, write_basalt
-from rigwake.exporters.base import ExportOptions, Notes, determined_part, read_text
+from rigwake.exporters.base import (
+    ExportOptions,
+    Notes,
+    determined_part,
+    read_json_file,
+    read_text,
+    read_yaml_file,
+)
 from rigwake.exporters.camodocal import EXTRINSICS, read_camodocal, write_camodocal
 from rigwake.exporters.colmap import RIG, read_colmap, write_colmap
 from rigwake.exporters.kalibr import read_kalibr, write_kalibr, write_openvins
@@ -122,23 +127,16 @@ def _recognise_folder(path: Path) -> str:
 
 
 def _recognise_json(path: Path) -> str:
-    try:
-        content = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path} is not JSON: {error}.") from error
+    content = read_json_file(path)
     if isinstance(content, Mapping) and "value0" in content:
         return "basalt"
     return "colmap" if isinstance(content, list) else "json"
 
 
 def _recognise_yaml(path: Path) -> str:
-    text = read_text(path)
-    if is_opencv_rig(text):
+    if is_opencv_rig(read_text(path)):
         return "opencv"
-    try:
-        content = load_yaml(text)
-    except CameraError as error:
-        raise InputError(f"{path} cannot be read as YAML: {error.cause}") from error
+    content = read_yaml_file(path)
     if isinstance(content, Mapping) and "cam0" in content:
         return "kalibr"
     return "rigwake"  # whose reader says best what is wrong with any other YAML

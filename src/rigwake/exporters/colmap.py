@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from rigwake.atomic import write_text_atomic
 from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.cameras.base import CameraModel
 from rigwake.cameras.formats import camera_from_colmap, camera_to_colmap
@@ -24,10 +23,12 @@ from rigwake.exporters.base import (
     foreign_calibration,
     foreign_camera,
     header,
+    read_json_file,
     read_text,
     refer_to_camera,
     require_lenses,
     transform_from_parts,
+    write_files,
 )
 from rigwake.exporters.lenses import write_lens
 from rigwake.geometry.se3 import SE3
@@ -66,23 +67,25 @@ def write_colmap(calibration: Calibration, path: Path, options: ExportOptions, n
         entries.append({**entry, "camera_model_name": model, "camera_params": params})
         values = " ".join(repr(float(p)) for p in params)
         lines.append(f"{number} {model} {written.width_px} {written.height_px} {values}")
-    write_text_atomic(path / RIG, json.dumps([{"cameras": entries}], indent=2, allow_nan=False) + "\n")
     comments = [f"# {line}" for line in header(calibration, notes + more)]
-    write_text_atomic(path / CAMERAS, "\n".join([*comments, *lines]) + "\n")
-    return more
+    files = {
+        path / RIG: json.dumps([{"cameras": entries}], indent=2, allow_nan=False) + "\n",
+        path / CAMERAS: "\n".join([*comments, *lines]) + "\n",
+    }
+    return [*more, *write_files(files)]
 
 
 def read_colmap(path: Path) -> Calibration:
     """The first rig of a rig config (or of its folder); image sizes come from a `cameras.txt` beside it."""
     path = path / RIG if path.is_dir() else path
     try:
-        entries = json.loads(read_text(path))[0]["cameras"]
+        entries = read_json_file(path)[0]["cameras"]
         sizes = _image_sizes(path.parent / CAMERAS)
         if sizes and len(sizes) != len(entries):
             raise InputError(f"{path}: {len(entries)} cameras, but {len(sizes)} in {CAMERAS}.")
         cameras = [_camera(entry, sizes[k] if sizes else None, path) for k, entry in enumerate(entries)]
         references = [c.name for c, e in zip(cameras, entries, strict=True) if e.get("ref_sensor")]
-    except (json.JSONDecodeError, KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path} is not a rig config of COLMAP: {type(error).__name__}: {error}.") from error
     if len(references) != 1:
         raise InputError(f"{path}: {len(references)} reference sensors, exactly one is needed.")

@@ -16,7 +16,6 @@ from rigwake.atomic import write_text_atomic
 from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.cameras.base import CameraModel
 from rigwake.cameras.formats import camera_from_kalibr, camera_to_kalibr
-from rigwake.cameras.opencv_yaml import load_yaml
 from rigwake.errors import CameraError, InputError
 from rigwake.exporters.base import (
     IMU,
@@ -25,7 +24,7 @@ from rigwake.exporters.base import (
     foreign_calibration,
     foreign_camera,
     header,
-    read_text,
+    read_yaml_file,
     require_lenses,
     require_reference,
     rows,
@@ -100,7 +99,7 @@ def _entries(
 
 def read_kalibr(path: Path) -> Calibration:
     """A camchain of Kalibr or OpenVINS; the reference is the IMU, or without it the first camera."""
-    content = load_yaml(read_text(path))
+    content = read_yaml_file(path)
     if not isinstance(content, Mapping):
         raise InputError(f"{path} is not a camchain.")
     keys = sorted((k for k in content if re.fullmatch(r"cam\d+", str(k))), key=lambda k: int(str(k)[3:]))

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from rigwake.atomic import write_text_atomic
 from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.cameras.base import CameraModel
 from rigwake.cameras.catalogue import camera_from_params
@@ -31,6 +30,7 @@ from rigwake.exporters.base import (
     header,
     read_text,
     require_lenses,
+    write_files,
 )
 from rigwake.exporters.lenses import write_lens
 from rigwake.geometry import so3
@@ -61,6 +61,7 @@ def _lens(camera: CameraModel) -> tuple[str, list[float]]:
 def write_mrcal(calibration: Calibration, path: Path, options: ExportOptions, notes: Notes) -> Notes:
     """The folder, `NAME.cameramodel` per camera."""
     more: Notes = []
+    files: dict[Path, str] = {}
     comments = [f"# {line}" for line in header(calibration, notes)]
     for name, lens in require_lenses(calibration, "mrcal").items():
         (model, intrinsics), written, lens_notes = write_lens(
@@ -77,8 +78,8 @@ def write_mrcal(calibration: Calibration, path: Path, options: ExportOptions, no
             "imagersize": [written.width_px, written.height_px],
         }
         text = pprint.pformat(content, sort_dicts=False, width=110)
-        write_text_atomic(path / f"{file_stem(name)}{SUFFIX}", "\n".join([*comments, text]) + "\n")
-    return more
+        files[path / f"{file_stem(name)}{SUFFIX}"] = "\n".join([*comments, text]) + "\n"
+    return [*more, *write_files(files)]
 
 
 def read_mrcal(path: Path) -> Calibration:

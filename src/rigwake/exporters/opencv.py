@@ -9,9 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from rigwake.atomic import write_text_atomic
 from rigwake.calibration import CalibratedCamera, Calibration
-from rigwake.cameras.opencv_yaml import camera_from_opencv, camera_to_opencv, load_yaml
+from rigwake.cameras.opencv_yaml import camera_from_opencv, camera_to_opencv
 from rigwake.errors import InputError
 from rigwake.exporters.base import (
     ExportOptions,
@@ -20,9 +19,10 @@ from rigwake.exporters.base import (
     foreign_calibration,
     foreign_camera,
     header,
-    read_text,
+    read_yaml_file,
     require_lenses,
     transform_from_matrix,
+    write_files,
 )
 from rigwake.exporters.lenses import write_lens
 from rigwake.geometry.so3 import Array
@@ -34,6 +34,7 @@ _MARK = "rig_from_cam"
 def write_opencv(calibration: Calibration, path: Path, options: ExportOptions, notes: Notes) -> Notes:
     """The folder, `NAME.yaml` per camera."""
     more: Notes = []
+    files: dict[Path, str] = {}
     comments = [f"# {line}" for line in header(calibration, notes)]
     for name, lens in require_lenses(calibration, "OpenCV").items():
         text, _, lens_notes = write_lens(lens, camera_to_opencv, _LENSES, options.max_fit_error_px, name)
@@ -50,8 +51,8 @@ def write_opencv(calibration: Calibration, path: Path, options: ExportOptions, n
         ]
         if camera.time_offset_s is not None:
             lines.append(f"time_offset_s: {camera.time_offset_s!r}")
-        write_text_atomic(path / f"{file_stem(name)}.yaml", "\n".join(lines) + "\n")
-    return more
+        files[path / f"{file_stem(name)}.yaml"] = "\n".join(lines) + "\n"
+    return [*more, *write_files(files)]
 
 
 def _quoted(text: str) -> str:
@@ -75,7 +76,7 @@ def read_opencv(path: Path) -> Calibration:
     cameras: list[CalibratedCamera] = []
     frames: set[str] = set()
     for file in files:
-        content = load_yaml(read_text(file))
+        content = read_yaml_file(file)
         if not isinstance(content, Mapping) or _MARK not in content:
             raise InputError(f"{file} does not hold {_MARK}.")
         matrix = content[_MARK]

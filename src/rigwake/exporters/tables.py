@@ -21,6 +21,7 @@ from rigwake.exporters.base import (
     Notes,
     foreign_calibration,
     foreign_camera,
+    read_json_file,
     read_text,
     transform_from_parts,
 )
@@ -50,11 +51,7 @@ def write_json(calibration: Calibration, path: Path, options: ExportOptions, not
 
 def read_json(path: Path) -> Calibration:
     """What `write_json` wrote."""
-    try:
-        content = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path} is not JSON: {error}.") from error
-    return calibration_from_dict(content, str(path))
+    return calibration_from_dict(read_json_file(path), str(path))
 
 
 def write_csv(calibration: Calibration, path: Path, options: ExportOptions, notes: Notes) -> Notes:
@@ -93,7 +90,10 @@ def _cell(text: str) -> str:
 
 def read_csv(path: Path) -> Calibration:
     """What `write_csv` wrote; empty cells are what is not determined."""
-    table = list(csv.DictReader(io.StringIO(read_text(path))))
+    try:
+        table = list(csv.DictReader(io.StringIO(read_text(path))))
+    except csv.Error as error:
+        raise InputError(f"{path} is not a table: {error}.") from error
     missing = {"camera", *_POSITION, *_QUATERNION} - set(table[0] if table else ())
     if missing:
         raise InputError(f"{path} lacks the columns {', '.join(sorted(missing))}.")
