@@ -17,7 +17,11 @@ from rigwake.recording import GnssStream
 from rigwake.trajectory import Trajectory
 
 _ANTENNA_STD_M = 5.0  # prior: an antenna is on the same vessel as the camera
-_CHI_SQUARE_3_999 = 16.27  # 99.9 % of a chi-square with three degrees of freedom
+CHI_SQUARE_3_999 = 16.27  # 99.9 % of a chi-square with three degrees of freedom
+CHI_SQUARE_3_MEDIAN = 2.37
+_DRIFT_SHARE = (
+    0.005  # of the path: what the visual trajectory itself may be off; only gross errors are refused here
+)
 _MAX_GAP_S = 1.0  # fixes in a longer gap between poses are not used
 _MIN_FIXES = 6
 
@@ -51,7 +55,8 @@ def align_gnss(
 
     trajectory: one segment, `world_from_cam`, up to scale. time_offset_s: `t_gnss = t_cam + time_offset_s`.
     antenna_cam: known position (held); None: estimated, with a weak prior that it is within metres of the camera.
-    Gauss-Newton from Umeyama's alignment, fixes weighted by their covariances and gated by chi-square.
+    Gauss-Newton from Umeyama's alignment, fixes weighted by their covariances and gated by chi-square, with room
+    for the drift of the visual trajectory: a fix that it contradicts by centimetres may well be the better one.
 
     Raises UnobservableError if the path is too short or straight against the noise of the fixes.
     """
@@ -63,6 +68,7 @@ def align_gnss(
     except EstimationError as cause:
         raise _undetermined(trajectory.name) from cause
     whitening = np.linalg.cholesky(np.linalg.inv(covariances))
+    white_per_metre = np.linalg.norm(whitening, axis=(1, 2))
     x = _Fit(start, np.zeros(3) if antenna_cam is None else np.asarray(antenna_cam, dtype=np.float64))
     prior = np.full(3, _ANTENNA_STD_M**-2.0 if antenna_cam is None else 1e12)
     centre_of_prior = x.antenna_cam.copy()
@@ -72,9 +78,10 @@ def align_gnss(
         error, J = x.linearise(centres, rotations, fixes)
         white = np.einsum("nji,nj->ni", whitening, error)
         squares = (white**2).sum(axis=1)
-        # while the fit is rough the gate follows the residuals; at the end it is the fixes' own
-        spread = max(float(np.median(squares)) / 2.37, 1.0)
-        used = squares <= _CHI_SQUARE_3_999 * spread
+        # while the fit is rough the gate follows the residuals
+        spread = max(float(np.median(squares)) / CHI_SQUARE_3_MEDIAN, 1.0)
+        drift = _DRIFT_SHARE * x.alignment.scale * trajectory.path_length
+        used = squares <= CHI_SQUARE_3_999 * spread + (white_per_metre * drift) ** 2
         WJ = np.einsum("nji,njk->nik", whitening, J)[used]
         information = np.einsum("nik,nil->kl", WJ, WJ)
         gradient = np.einsum("nik,ni->k", WJ, white[used])

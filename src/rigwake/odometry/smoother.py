@@ -32,6 +32,7 @@ from rigwake.geometry.interpolate import TransformSpline
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
 from rigwake.geometry.triangulation import triangulate_rays
+from rigwake.odometry.gnss import CHI_SQUARE_3_999, CHI_SQUARE_3_MEDIAN
 from rigwake.odometry.inertial import with_noise
 from rigwake.odometry.metric import MetricStart
 from rigwake.odometry.result import OdometryResult
@@ -60,7 +61,8 @@ class SmoothedOdometry:
     trajectory: `world_from_cam`, camera clock, of every frame in the time of the states, with covariances of the
     poses (those of the nearest state). rig_from_cam, time_offset_s, gyro_bias, accel_bias (mean over the
     recording), antenna_rig: at the optimum. noise_factor: how much larger residuals are than the tracks promised.
-    bridged: frames without a visual pose that the IMU carried over. solution: the adjusted problem.
+    gnss_gated: fixes that the smoothed path refused. bridged: frames without a visual pose that the IMU carried
+    over. solution: the adjusted problem.
     """
 
     trajectory: Trajectory
@@ -70,6 +72,7 @@ class SmoothedOdometry:
     accel_bias: Array | None
     antenna_rig: Array | None
     noise_factor: float
+    gnss_gated: int
     bridged: int
     solution: RigSolution
 
@@ -95,6 +98,7 @@ def smooth(
     problem = _problem(tracks, camera, visual, start, noisy_imu, gnss)
     rough = solve(problem, _ROUGH)
     weighted, noise_factor = _reweighted(rough)
+    weighted, gated = _gated(weighted)
     solution = solve(weighted, _FINE)
     trajectory, bridged = _every_frame(tracks, visual, solution)
     values = solution.problem.states.inertial
@@ -107,6 +111,7 @@ def smooth(
         values.accel_bias.mean(axis=0) if values is not None else None,
         solution.problem.antenna.position_rig if gnss is not None else None,
         noise_factor,
+        gated,
         bridged,
         solution,
     )
@@ -237,6 +242,25 @@ def _reweighted(rough: RigSolution) -> tuple[RigProblem, float]:
     left = observations.take(kept)
     left = replace(left, landmark_indices=renumbered.astype(np.int64), std_px=left.std_px * factor)
     return replace(rough.problem, observations=left, landmarks=rough.problem.landmarks.take(used)), factor
+
+
+def _gated(problem: RigProblem) -> tuple[RigProblem, int]:
+    """Without the fixes that the smoothed path contradicts beyond the chi-square gate, and how many those are."""
+    gnss = problem.gnss
+    if gnss is None:
+        return problem, 0
+    times = seconds_since_start(problem, gnss.timestamps_ns)
+    inside = (times >= 0) & (gnss.timestamps_ns <= problem.states.timestamps_ns[-1])
+    rig = rig_at(
+        problem, layout_of(problem), times[inside], nearest_states(problem, times[inside]), moving=True
+    )
+    antennas = rig.world_from_body * np.tile(problem.antenna.position_rig, (int(inside.sum()), 1))
+    error = antennas - gnss.position_enu[inside]
+    squares = np.einsum("ni,nij,nj->n", error, np.linalg.inv(gnss.covariances[inside]), error)
+    spread = max(float(np.median(squares)) / CHI_SQUARE_3_MEDIAN, 1.0)  # receivers are optimistic, too
+    kept = inside.copy()
+    kept[inside] = squares <= CHI_SQUARE_3_999 * spread
+    return replace(problem, gnss=_chosen_fixes(gnss, kept)), int(inside.sum() - kept.sum())
 
 
 def _every_frame(tracks: Tracks, visual: OdometryResult, solution: RigSolution) -> tuple[Trajectory, int]:
