@@ -10,23 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from rigwake import __version__
-from rigwake.adjustment.assemble import assemble_problem
-from rigwake.adjustment.checks import (
-    hand_over_errors,
-    residual_statistics,
-    split_half,
-    split_half_summary,
-)
-from rigwake.adjustment.hand_over import HandOver, adjust_with_hand_over
-from rigwake.adjustment.rounds import adjust
-from rigwake.adjustment.start import FirstRig, first_rig
-from rigwake.adjustment.values import AdjustedRig, RigMeasurements
-from rigwake.adjustment.verdicts import ReferenceFrame, calibrated_cameras
-from rigwake.bundle.covariance import covariance_of
+from rigwake.adjustment.start import FirstRig
 from rigwake.calibration import Calibration, save_calibration
 from rigwake.config import CalibrateConfig
 from rigwake.errors import InputError, UnobservableError
-from rigwake.geometry.se3 import SE3
 from rigwake.pipeline.camera_stage import (
     CameraJob,
     CameraOutcome,
@@ -38,12 +25,12 @@ from rigwake.pipeline.camera_stage import (
 from rigwake.pipeline.outputs import write_outputs
 from rigwake.pipeline.parallel import Progress, process_cameras
 from rigwake.pipeline.prior import RigPrior
+from rigwake.pipeline.rig_stage import estimate_rig, start_rig
 from rigwake.pipeline.selection import Selection, select
 from rigwake.pipeline.stage_files import StageLedger, input_fingerprint, stage_key
 from rigwake.readers.open import open_recording
 from rigwake.readers.topics import TopicMap
 from rigwake.readers.trajectories import read_trajectory
-from rigwake.recording import Recording
 from rigwake.report import build_report, load_report_content
 from rigwake.tracks import load_tracks
 from rigwake.trajectory import Trajectory
@@ -91,21 +78,26 @@ def calibrate(
     outcomes = _each_camera(selection, Path(recording), out, config, ledger, trajectories is None, progress)
     working = _working(outcomes)
     tracks = {name: load_tracks(tracks_file(out, name)) for name in working}
-    first = _start(selection, working, _trajectories(working, out, trajectories), config, prior)
+    first = start_rig(selection, _trajectories(working, out, trajectories), config, prior)
     save_calibration(first.handeye, out / "initial_rig.yaml")
-    measurements = RigMeasurements(
-        {name: tracks[name] for name in first.start.cameras}, selection.imu, selection.gnss
+    rig = estimate_rig(
+        opened,
+        selection,
+        tracks,
+        first,
+        config,
+        prior,
+        masks=out / "masks",
+        tell=lambda words, share: progress("rig", words, share),
     )
-    adjusted, handed_over = _adjust(measurements, first, prior, selection, config, out, progress)
     failed = {o.name: o.failed for o in outcomes if o.failed is not None} | dict(first.failed)
     notes = (*selection.notes, *(f"{o.name}: {n}" for o in outcomes for n in o.notes), *first.notes)
-    calibration = _conclude(opened, selection, first, adjusted, handed_over, config, progress)
     calibration = replace(
-        calibration,
-        checks={**calibration.checks, "failed_cameras": failed, "notes": list(notes)},
+        rig.calibration,
+        checks={**rig.calibration.checks, "failed_cameras": failed, "notes": list(notes)},
         provenance=_provenance(Path(recording), config, first),
     )
-    write_outputs(out, calibration, adjusted, first, selection, handed_over)
+    write_outputs(out, calibration, rig.adjusted, first, selection, rig.handed_over)
     progress("rig", "writing the report", 0.95)
     build_report(load_report_content(out))
     return CalibrationRun(calibration, out, failed, notes)
@@ -173,102 +165,6 @@ def _trajectories(working: list[str], out: Path, foreign: Path | str | None) -> 
             remedy=f"Name the files {', '.join(f'{name}.tum' for name in working)}.",
         )
     return found
-
-
-def _start(
-    selection: Selection,
-    working: list[str],
-    trajectories: dict[str, Trajectory],
-    config: CalibrateConfig,
-    prior: RigPrior,
-) -> FirstRig:
-    models = {name: selection.cameras[name].model for name in working}
-    first = first_rig(
-        trajectories,
-        {name: model for name, model in models.items() if model is not None},
-        selection.imu,
-        selection.gnss,
-    )
-    return prior.applied_to(first, config)
-
-
-def _adjust(
-    measurements: RigMeasurements,
-    first: FirstRig,
-    prior: RigPrior,
-    selection: Selection,
-    config: CalibrateConfig,
-    out: Path,
-    progress: Progress,
-) -> tuple[AdjustedRig, HandOver]:
-    """The rig adjustment: alone first, then with landmarks handed over between cameras and times."""
-    assembled = assemble_problem(measurements, first.start, config.adjustment)
-    assembled = replace(assembled, problem=prior.constrained(assembled.problem, first))
-    progress("rig", f"adjusting {len(assembled.problem.observations)} observations", 0.0)
-    adjusted = adjust(assembled, config.adjustment)
-    if not config.adjustment.cross_camera:
-        return adjusted, HandOver.nothing()
-    return adjust_with_hand_over(
-        adjusted,
-        selection.cameras,
-        out / "masks",
-        config.adjustment,
-        config.hand_over,
-        lambda words: progress("rig", words, 0.5),
-    )
-
-
-def _conclude(
-    recording: Recording,
-    selection: Selection,
-    first: FirstRig,
-    adjusted: AdjustedRig,
-    handed_over: HandOver,
-    config: CalibrateConfig,
-    progress: Progress,
-) -> Calibration:
-    """Covariance, verdicts and checks."""
-    progress("rig", "checking", 0.8)
-    solution = adjusted.solution
-    reference = reference_frame(recording, selection, first, config.reference)
-    covariance = covariance_of(solution.problem, clustered=True)
-    statistics = residual_statistics(solution)
-    for name, numbers in statistics.items():
-        numbers |= {"noise_factor": adjusted.noise_factors[name], "dropped": adjusted.dropped[name]}
-    topics = {name: stream.topic for name, stream in selection.cameras.items()}
-    calibration = calibrated_cameras(solution, covariance, reference, statistics, topics)
-    if not any(camera.determined_axes.any() for camera in calibration.cameras.values()):
-        raise UnobservableError(
-            "The motion determined nothing of any camera.",
-            remedy=next(iter(calibration.cameras.values())).undetermined[0].remedy,
-        )
-    return calibration.with_checks(
-        residuals=statistics,
-        split_half=split_half_summary(split_half(solution.problem, reference, config.adjustment)),
-        hand_over=hand_over_errors(solution, handed_over.unused),
-        scale_source=first.scale_source,
-        converged=solution.report.converged,
-    )
-
-
-def reference_frame(
-    recording: Recording, selection: Selection, first: FirstRig, wanted: str
-) -> ReferenceFrame:
-    """The frame to report in; `base_link` needs the recording to say where the IMU sits on it."""
-    if wanted == "auto":
-        wanted = "imu" if selection.imu is not None else first.leader
-    if wanted == "imu" and selection.imu is not None:
-        return ReferenceFrame("imu", SE3.identity())
-    if wanted == "base_link" and selection.imu is not None:
-        base_from_imu = recording.static_transforms.get(("base_link", selection.imu.frame_id))
-        if base_from_imu is None:
-            raise InputError(
-                "The recording does not say where the IMU sits on base_link.",
-                consequence="The cameras are known in the IMU's frame only.",
-                remedy="Use --reference imu, or record /tf_static.",
-            )
-        return ReferenceFrame("base_link", base_from_imu)
-    return ReferenceFrame(wanted, None)
 
 
 def _provenance(recording: Path, config: CalibrateConfig, first: FirstRig) -> dict[str, Any]:

@@ -1,0 +1,164 @@
+"""The rig from every camera's trajectory and tracks: first values, adjustment, checks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rigwake.adjustment.assemble import assemble_problem
+from rigwake.adjustment.checks import (
+    hand_over_errors,
+    residual_statistics,
+    split_half,
+    split_half_summary,
+)
+from rigwake.adjustment.hand_over import HandOver, adjust_with_hand_over
+from rigwake.adjustment.rounds import adjust
+from rigwake.adjustment.start import FirstRig, first_rig
+from rigwake.adjustment.values import AdjustedRig, RigMeasurements
+from rigwake.adjustment.verdicts import ReferenceFrame, calibrated_cameras
+from rigwake.bundle.covariance import covariance_of
+from rigwake.calibration import Calibration
+from rigwake.config import CalibrateConfig
+from rigwake.errors import InputError, UnobservableError
+from rigwake.geometry.se3 import SE3
+from rigwake.pipeline.prior import RigPrior
+from rigwake.pipeline.selection import Selection
+from rigwake.recording import Recording
+from rigwake.tracks import Tracks
+from rigwake.trajectory import Trajectory
+
+Tell = Callable[[str, float], None]
+"""Told what is being done and which share of it is done."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigEstimate:
+    """The rig, and what the adjustment and the hand-over left."""
+
+    calibration: Calibration
+    adjusted: AdjustedRig
+    handed_over: HandOver
+
+
+def start_rig(
+    selection: Selection, trajectories: Mapping[str, Trajectory], config: CalibrateConfig, prior: RigPrior
+) -> FirstRig:
+    """First values from every camera's own motion (by camera, up to scale or metric) and what is known beforehand.
+
+    Raises UsageError for a prior that names what is not there, UnobservableError when the motion determines nothing.
+    """
+    models = {name: selection.cameras[name].model for name in trajectories}
+    first = first_rig(
+        trajectories,
+        {name: model for name, model in models.items() if model is not None},
+        selection.imu,
+        selection.gnss,
+    )
+    return prior.applied_to(first, config)
+
+
+def estimate_rig(
+    recording: Recording,
+    selection: Selection,
+    tracks: Mapping[str, Tracks],
+    first: FirstRig,
+    config: CalibrateConfig,
+    prior: RigPrior,
+    *,
+    masks: Path,
+    tell: Tell = lambda words, share: None,
+) -> RigEstimate:
+    """The rig from first values and what was tracked.
+
+    tracks: by camera, of all that `first` knows. prior: the one that `first` was made with. masks: folder of the
+    cameras' masks, for landmarks that are handed over. Images are only read with `config.adjustment.cross_camera`.
+
+    Raises UsageError for a reference that is not there, UnobservableError when the motion
+    determines nothing, EstimationError when no trustworthy answer was found.
+    """
+    measurements = RigMeasurements(
+        {name: tracks[name] for name in first.start.cameras}, selection.imu, selection.gnss
+    )
+    adjusted, handed_over = _adjust(measurements, first, prior, selection, config, masks, tell)
+    tell("checking", 0.8)
+    reference = reference_frame(recording, selection, first, config.reference)
+    calibration = _conclude(selection, first, adjusted, handed_over, reference, config)
+    return RigEstimate(calibration, adjusted, handed_over)
+
+
+def _adjust(
+    measurements: RigMeasurements,
+    first: FirstRig,
+    prior: RigPrior,
+    selection: Selection,
+    config: CalibrateConfig,
+    masks: Path,
+    tell: Tell,
+) -> tuple[AdjustedRig, HandOver]:
+    """The rig adjustment: alone first, then with landmarks handed over between cameras and times."""
+    assembled = assemble_problem(measurements, first.start, config.adjustment)
+    assembled = replace(assembled, problem=prior.constrained(assembled.problem, first))
+    tell(f"adjusting {len(assembled.problem.observations)} observations", 0.0)
+    adjusted = adjust(assembled, config.adjustment)
+    if not config.adjustment.cross_camera:
+        return adjusted, HandOver.nothing()
+    return adjust_with_hand_over(
+        adjusted,
+        selection.cameras,
+        masks,
+        config.adjustment,
+        config.hand_over,
+        lambda words: tell(words, 0.5),
+    )
+
+
+def _conclude(
+    selection: Selection,
+    first: FirstRig,
+    adjusted: AdjustedRig,
+    handed_over: HandOver,
+    reference: ReferenceFrame,
+    config: CalibrateConfig,
+) -> Calibration:
+    """Covariance, verdicts and checks."""
+    solution = adjusted.solution
+    covariance = covariance_of(solution.problem, clustered=True)
+    statistics = residual_statistics(solution)
+    for name, numbers in statistics.items():
+        numbers |= {"noise_factor": adjusted.noise_factors[name], "dropped": adjusted.dropped[name]}
+    topics = {name: stream.topic for name, stream in selection.cameras.items()}
+    calibration = calibrated_cameras(solution, covariance, reference, statistics, topics)
+    if not any(camera.determined_axes.any() for camera in calibration.cameras.values()):
+        raise UnobservableError(
+            "The motion determined nothing of any camera.",
+            remedy=next(iter(calibration.cameras.values())).undetermined[0].remedy,
+        )
+    return calibration.with_checks(
+        residuals=statistics,
+        split_half=split_half_summary(split_half(solution.problem, reference, config.adjustment)),
+        hand_over=hand_over_errors(solution, handed_over.unused),
+        scale_source=first.scale_source,
+        converged=solution.report.converged,
+    )
+
+
+def reference_frame(
+    recording: Recording, selection: Selection, first: FirstRig, wanted: str
+) -> ReferenceFrame:
+    """The frame to report in; `base_link` needs the recording to say where the IMU sits on it."""
+    if wanted == "auto":
+        wanted = "imu" if selection.imu is not None else first.leader
+    if wanted == "imu" and selection.imu is not None:
+        return ReferenceFrame("imu", SE3.identity())
+    if wanted == "base_link" and selection.imu is not None:
+        base_from_imu = recording.static_transforms.get(("base_link", selection.imu.frame_id))
+        if base_from_imu is None:
+            raise InputError(
+                "The recording does not say where the IMU sits on base_link.",
+                consequence="The cameras are known in the IMU's frame only.",
+                remedy="Use --reference imu, or record /tf_static.",
+            )
+        return ReferenceFrame("base_link", base_from_imu)
+    return ReferenceFrame(wanted, None)
