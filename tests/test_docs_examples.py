@@ -6,6 +6,7 @@ import runpy
 from pathlib import Path
 
 import pytest
+import yaml
 
 from calibrated_rigs import PINHOLE, boat, without_vertical
 from rigwake.calibration import save_calibration
@@ -70,3 +71,28 @@ def test_the_example_exports_what_the_formats_can_hold(
     refused = {line.split()[0] for line in said.splitlines() if " refused: " in line}
     assert refused == {"basalt", "mrcal"}  # noise of the IMU is missing; no fisheye
     assert len(list((tmp_path / "out").iterdir())) == 9
+
+
+def test_the_motions_of_the_picture_determine_what_the_page_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["motions.py", str(tmp_path / "motions.png")])
+    runpy.run_path(str(ROOT / "examples" / "motions.py"), run_name="__main__")
+    straight, circle, calm, waves = capsys.readouterr().out.splitlines()
+    assert "rotation not determined; offset not determined" in straight
+    assert "rotation not determined; offset not determined" in circle
+    assert "rotation ±" in calm
+    assert "z –" in calm
+    assert re.search(r"rotation ± .*x [\d.]+ cm, y [\d.]+ cm, z [\d.]+ cm", waves)
+    assert (tmp_path / "motions.png").stat().st_size > 10_000
+
+
+def test_pages_of_the_site_exist_and_links_between_them_hold() -> None:
+    site = yaml.safe_load((ROOT / "mkdocs.yml").read_text())
+    named = re.findall(r"[\w/]+\.md", str(site["nav"]))
+    assert len(named) > 10
+    assert [page for page in named if not (ROOT / "docs" / page).is_file()] == []
+    for page in (ROOT / "docs").glob("*.md"):
+        for link in re.findall(r"\]\(([^)#\s]+)\)", page.read_text()):
+            if "://" not in link:
+                assert (page.parent / link).exists(), f"{page.name}: {link}"
