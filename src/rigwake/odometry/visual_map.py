@@ -145,7 +145,9 @@ class VisualMap:
     def _angles(self, rows: Indices, points: Array) -> Array:
         frames = self.observations.frame[rows]
         seen = np.einsum("nji,nj->ni", self.rotation[frames], points - self.centre[frames])
-        return bearing_angles(SE3.identity(), seen, self.observations.bearings[rows])
+        angles = bearing_angles(SE3.identity(), seen, self.observations.bearings[rows])
+        # a point that an adjustment has pulled into the camera is in no direction
+        return np.where(np.any(seen != 0.0, axis=1), angles, np.inf)
 
     def _store(self, tracks: Indices, accepted: Mask, points: Array, segment: int) -> None:
         had_point = self.point_segment[tracks] == segment
