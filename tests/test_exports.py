@@ -2,8 +2,13 @@
 
 import csv
 import json
+import os
+import shutil
+import signal
+import socket
 import subprocess
 import sys
+import time
 import types
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -338,3 +343,62 @@ def test_csv_and_json(tmp_path: Path) -> None:
         assert float(row["std_z_m"]) == pytest.approx(rig.cameras[name].std_translation_m[2])
         transform = content["cameras"][name]["rig_from_cam"]
         assert transform["translation_m"] == position.tolist()
+
+
+LISTEN = """
+import json, sys, rospy, tf2_ros
+rospy.init_node("listener", anonymous=True)
+buffer = tf2_ros.Buffer()
+listener = tf2_ros.TransformListener(buffer)
+found = {}
+for child in sys.argv[2:]:
+    t = buffer.lookup_transform(sys.argv[1], child, rospy.Time(0), rospy.Duration(20)).transform
+    p, q = t.translation, t.rotation
+    found[child] = [sys.argv[1], [p.x, p.y, p.z], [q.x, q.y, q.z, q.w]]
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.slow
+def test_launched_in_ros1(tmp_path: Path) -> None:
+    """Debian's roslaunch starts the file, a tf2 listener receives the transforms."""
+    python = debian("rospy", "roslaunch", "tf2_ros")
+    roslaunch = shutil.which("roslaunch")
+    if roslaunch is None or not Path("/usr/lib/tf2_ros/static_transform_publisher").exists():
+        pytest.skip("Debian's roslaunch and tf2_ros are not installed")
+    rig = boat("base_link")
+    export_calibration(rig, "ros-static-tf", tmp_path / "cameras.launch")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    master = {"ROS_MASTER_URI": f"http://127.0.0.1:{port}", "ROS_IP": "127.0.0.1"}
+    environment = {**os.environ, **master, "ROS_HOME": str(tmp_path), "ROS_LOG_DIR": str(tmp_path)}
+    command = [python, roslaunch, "-p", str(port), str(tmp_path / "cameras.launch")]
+    frames = [f"{name}_optical_frame" for name in rig.cameras]
+    with (tmp_path / "launch.log").open("w") as log:
+        launched = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
+        try:
+            wait_for(port, launched)
+            answer = subprocess.run(
+                [python, "-c", LISTEN, "base_link", *frames],
+                env=environment,
+                capture_output=True,
+                text=True,
+                check=True,
+                timeout=60,
+            ).stdout
+        finally:
+            launched.send_signal(signal.SIGINT)
+            launched.wait(30)
+    check_frames(rig, json.loads(answer.splitlines()[-1]))
+
+
+def wait_for(port: int, process: subprocess.Popen) -> None:
+    """Until somebody listens at the port."""
+    for _ in range(300):
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        assert process.poll() is None, "roslaunch ended"
+        time.sleep(0.1)
+    raise AssertionError("the ROS master did not start")
