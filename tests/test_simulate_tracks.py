@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 from rigwake.errors import UsageError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.simulate.scenario import Imu, Scenario, Sea, build_scenario, load_scenario, preset_names
+from rigwake.simulate.scenario import (
+    Imu,
+    Scenario,
+    Sea,
+    build_scenario,
+    load_scenario,
+    parse_scenario,
+    preset_names,
+)
 from rigwake.simulate.sensors import imu_mounting, simulate_imu
 from rigwake.simulate.setup import Simulation, prepare
 from rigwake.simulate.tracks_only import simulate_tracks
@@ -71,6 +79,14 @@ def test_bad_scenarios_are_refused_by_field(thesis: Scenario, change: dict, name
 def test_a_missing_scenario_lists_the_presets() -> None:
     with pytest.raises(UsageError, match="thesis"):
         load_scenario("atlantis")
+
+
+def test_a_scenario_may_start_from_a_preset(thesis: Scenario) -> None:
+    scenario = parse_scenario("{base: thesis, name: short, duration_s: 5, sea: {hs_m: 0.1}}")
+    assert (scenario.duration_s, scenario.sea.hs_m, scenario.sea.tp_s) == (5, 0.1, thesis.sea.tp_s)
+    assert scenario.cameras == thesis.cameras
+    with pytest.raises(UsageError, match="base"):
+        parse_scenario("{base: atlantis}")
 
 
 @pytest.mark.parametrize(("hs_m", "tp_s"), [(0.25, 3.2), (0.5, 4.0), (1.0, 6.0)])

@@ -263,9 +263,7 @@ def load_scenario(source: str | Path) -> Scenario:
     """A preset by name, or a scenario file. UsageError names what is wrong, and where."""
     text = str(source)
     if text in preset_names():
-        return parse_scenario(
-            (resources.files("rigwake.simulate") / "scenarios" / f"{text}.yaml").read_text(), text
-        )
+        return parse_scenario(_preset_text(text), text)
     path = Path(source)
     if not path.is_file():
         raise UsageError(
@@ -276,12 +274,39 @@ def load_scenario(source: str | Path) -> Scenario:
 
 
 def parse_scenario(text: str, origin: str = "scenario") -> Scenario:
-    """A scenario from YAML text; `origin` names it in errors (UsageError)."""
+    """A scenario from YAML text; `origin` names it in errors (UsageError).
+
+    `base: PRESET` starts from a preset; what the text says replaces it, part by part.
+    """
+    return build_scenario(_document(text, origin), origin)
+
+
+def _preset_text(name: str) -> str:
+    return (resources.files("rigwake.simulate") / "scenarios" / f"{name}.yaml").read_text(encoding="utf-8")
+
+
+def _document(text: str, origin: str) -> Any:
     try:
         document = yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise UsageError(f"{origin} is not YAML: {error}") from error
-    return build_scenario(document, origin)
+    if not isinstance(document, dict) or "base" not in document:
+        return document
+    base = document.pop("base")
+    if base not in preset_names():
+        raise UsageError(
+            f"{origin}: base: no preset {base!r}.", remedy=f"Presets: {', '.join(preset_names())}."
+        )
+    return _merged(_document(_preset_text(base), base), document)
+
+
+def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """`above` over `below`, mapping by mapping; lists are replaced."""
+    merged = dict(below)
+    for key, value in above.items():
+        inside = isinstance(value, dict) and isinstance(below.get(key), dict)
+        merged[key] = _merged(below[key], value) if inside else value
+    return merged
 
 
 def build_scenario(document: Any, origin: str = "scenario") -> Scenario:
