@@ -56,7 +56,8 @@ class CalibrateConfig(BaseModel):
     estimate_line_delay: bool = False
     imu_noise: ImuNoiseSettings = ImuNoiseSettings()
     tracking: TrackingOptions = TrackingOptions()
-    odometry: OdometryOptions = OdometryOptions()
+    # the rig adjustment follows, so the odometry of a camera need not be perfect
+    odometry: OdometryOptions = OdometryOptions(adjust_all_frames=False)
     adjustment: AdjustmentOptions = AdjustmentOptions()
     hand_over: HandOverOptions = HandOverOptions()
 

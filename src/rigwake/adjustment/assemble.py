@@ -64,7 +64,8 @@ def state_times(
 ) -> NDArray[np.int64]:
     """Stamps (rig clock) of the frames nearest to a regular grid, of the camera with the most frames inside the
     span that the rig's trajectory and the IMU cover."""
-    margin_ns = int(0.6e9 / options.state_rate_hz)
+    rate_hz = options.state_rate_without_imu_hz if measurements.imu is None else options.state_rate_hz
+    margin_ns = int(0.6e9 / rate_hz)
     first, last = start.world_from_rig.timestamps_ns[[0, -1]]
     if measurements.imu is not None:
         first = max(first, measurements.imu.timestamps_ns[0])
@@ -80,7 +81,7 @@ def state_times(
             "No camera has images within the span of the rig's trajectory and the IMU.",
             remedy="Check the clocks with `rigwake inspect`.",
         )
-    grid = np.arange(best[0], best[-1] + margin_ns, round(1e9 / options.state_rate_hz))
+    grid = np.arange(best[0], best[-1] + margin_ns, round(1e9 / rate_hz))
     after = np.clip(np.searchsorted(best, grid), 1, len(best) - 1)
     nearest = np.where(grid - best[after - 1] < best[after] - grid, after - 1, after)
     return best[np.unique(nearest)]
@@ -111,7 +112,8 @@ def _observe(
     before = np.maximum(after - 1, 0)
     nearest = np.where(at - frame_stamps[before] < frame_stamps[after] - at, before, after)
     gap_ns = np.abs(frame_stamps[nearest] - at)
-    frames = np.unique(nearest[gap_ns <= 0.6e9 / options.state_rate_hz])
+    usual_ns = np.median(np.diff(at)) if len(at) > 1 else 1e9
+    frames = np.unique(nearest[gap_ns <= 0.6 * usual_ns])
     kept = np.isin(tracks.frame_indices, frames)
     counts = np.bincount(tracks.track_ids[kept], minlength=int(tracks.track_ids.max(initial=0)) + 1)
     kept &= counts[tracks.track_ids] >= options.min_observations

@@ -42,7 +42,7 @@ class HandOverOptions:
 
     rounds: int = 2
     views_per_camera: int = 4
-    max_searches: int = 6000
+    max_searches: int = 8000
     search_px: float = 3.5
     max_view_angle_deg: float = 30.0
     max_stretch: float = 1.7

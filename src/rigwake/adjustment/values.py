@@ -22,22 +22,24 @@ Indices = NDArray[np.int64]
 class AdjustmentOptions:
     """Options of the adjustment; the defaults suit a minute or two of sailing with up to a dozen cameras.
 
-    state_rate_hz: rig states per second; observations at the frames nearest to them are used.
+    state_rate_hz: rig states per second; observations at the frames nearest to them are used. Without an IMU,
+        which carries the motion between them, there are `state_rate_without_imu_hz`.
     tracks_per_second: most tracks per camera and second that take part, the longest of each part of the image
         first. min_observations: fewest frames a track must be seen in.
     gate_stds: an observation further off than this many of its standard deviations is dropped between rounds.
     rounds: of solving and dropping. cross_camera: whether landmarks are matched across cameras and time.
     """
 
-    state_rate_hz: float = 4.0
-    tracks_per_second: int = 40
-    min_observations: int = 4
+    state_rate_hz: float = 2.5
+    state_rate_without_imu_hz: float = 10.0
+    tracks_per_second: int = 60
+    min_observations: int = 3
     gate_stds: float = 4.0
-    rounds: int = 3
+    rounds: int = 2
     cross_camera: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("state_rate_hz", "tracks_per_second", "gate_stds", "rounds"):
+        for name in ("state_rate_hz", "state_rate_without_imu_hz", "tracks_per_second", "gate_stds", "rounds"):
             if getattr(self, name) <= 0:
                 raise UsageError(f"adjustment option {name} must be positive, not {getattr(self, name)}.")
         if self.min_observations < 2:
