@@ -3,13 +3,16 @@
 import ast
 import re
 import runpy
+import shlex
 from pathlib import Path
 
 import pytest
+import typer
 import yaml
 
 from calibrated_rigs import PINHOLE, boat, without_vertical
 from rigwake.calibration import save_calibration
+from rigwake.cli.main import build_app
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.DOTALL)
@@ -96,3 +99,25 @@ def test_pages_of_the_site_exist_and_links_between_them_hold() -> None:
         for link in re.findall(r"\]\(([^)#\s]+)\)", page.read_text()):
             if "://" not in link:
                 assert (page.parent / link).exists(), f"{page.name}: {link}"
+
+
+def commands_of(page: Path) -> list[list[str]]:
+    """The words of every `rigwake ...` line of a code block."""
+    lines = re.findall(r"^ {4,}(rigwake [a-z].*)$", page.read_text(), re.MULTILINE)
+    return [shlex.split(line, comments=True)[1:] for line in lines if "..." not in line.split("#")[0]]
+
+
+def test_commands_in_the_documentation_exist() -> None:
+    verbs = typer.main.get_command(build_app()).commands
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    commands = [(page.name, words) for page in pages for words in commands_of(page)]
+    assert len(commands) > 12
+    for page, (verb, *words) in commands:
+        assert verb in verbs, f"{page}: rigwake {verb}"
+        known = {
+            option
+            for parameter in verbs[verb].params
+            for option in (*parameter.opts, *parameter.secondary_opts)
+        }
+        used = {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)}
+        assert used <= known | {"--help"}, f"{page}: rigwake {verb} {used - known}"
