@@ -24,7 +24,7 @@ _MIN_MATCHES = 12
 _MAX_GAP_S = 0.5
 
 
-def visual_turns(stream: CameraStream, *, frames: int = 200) -> Trajectory:
+def visual_turns(stream: CameraStream, *, frames: int = 150) -> Trajectory:
     """A trajectory whose rotations are the camera's turns, and whose positions are all zero.
 
     frames: at most so many, in a row, from the middle of the recording. It drifts by degrees, and points on the
