@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -205,10 +205,13 @@ class _Run:
 
     def _visual(self, tracks: Tracks, rotations: Array | None) -> OdometryResult:
         total = len(tracks.timestamps_ns)
+        alone = self.imu is None and self.gnss is None  # else the smoother adjusts all frames anyway
         return estimate_monocular(
             tracks,
             self.model,
-            self.options.odometry,
+            replace(
+                self.options.odometry, adjust_all_frames=alone and self.options.odometry.adjust_all_frames
+            ),
             rotations=rotations,
             progress=lambda done: self.progress("odometry", min(done, total), total),
         )

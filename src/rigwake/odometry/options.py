@@ -29,7 +29,7 @@ class OdometryOptions:
     min_inliers: int = 15
     min_inlier_share: float = 0.4
     min_parallax_stds: float = 15.0
-    keyframe_share: float = 0.8
+    keyframe_share: float = 0.5
     keyframe_parallax_deg: float = 2.0
     keyframe_interval_s: float = 0.5
     window: int = 8
