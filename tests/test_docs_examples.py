@@ -76,6 +76,7 @@ def test_the_example_exports_what_the_formats_can_hold(
     assert len(list((tmp_path / "out").iterdir())) == 9
 
 
+@pytest.mark.slow
 def test_the_motions_of_the_picture_determine_what_the_page_says(
     tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

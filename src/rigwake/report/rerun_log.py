@@ -21,12 +21,18 @@ def log_to_rerun(content: ReportContent, rrd: Path | None, view: bool) -> None:
         raise UsageError(
             "The rerun viewer is not installed.", remedy="pip install 'rigwake[rerun]', then run this again."
         ) from error
-    stream = rerun.RecordingStream("rigwake")
-    if view:
-        stream.spawn(connect=rrd is None)
     if rrd is not None:
         rrd.parent.mkdir(parents=True, exist_ok=True)
+        stream = rerun.RecordingStream("rigwake")
         stream.save(rrd)
+        _log(rerun, stream, content)
+    if view:
+        stream = rerun.RecordingStream("rigwake")
+        stream.spawn()
+        _log(rerun, stream, content)
+
+
+def _log(rerun: Any, stream: Any, content: ReportContent) -> None:
     stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     _log_cameras(rerun, stream, content)
     _log_motion(rerun, stream, content)
