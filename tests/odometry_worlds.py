@@ -38,7 +38,7 @@ def tracks_of(
     camera: CameraModel,
     *,
     seed: int = 0,
-    points: int = 600,
+    points: int = 350,
     noise_px: float = 0.2,
     longest: int = 60,
     wrong_share: float = 0.0,

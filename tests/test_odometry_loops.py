@@ -8,6 +8,7 @@ import pytest
 from odometry_worlds import circling, fisheye, tracks_of
 from rigwake.odometry.loop_closure import LoopOptions, find_loops, joined_tracks
 from rigwake.odometry.monocular import estimate_monocular
+from rigwake.odometry.result import OdometryResult
 from rigwake.recording import CameraStream, Frame
 from rigwake.tracks import Tracks
 
@@ -40,11 +41,16 @@ def broken_tracks() -> tuple[Tracks, np.ndarray]:
     return broken.take(kept), tracks.track_ids[kept]
 
 
-def test_an_outage_is_bridged_by_recognising_the_place():
+@pytest.fixture(scope="module")
+def broken() -> tuple[CameraStream, Tracks, np.ndarray, OdometryResult]:
     tracks, names = broken_tracks()
+    stream = CameraStream("front", tracks.timestamps_ns, StampedDots(tracks, names), 640, 480, fisheye())
+    return stream, tracks, names, estimate_monocular(tracks, fisheye())
+
+
+def test_an_outage_is_bridged_by_recognising_the_place(broken):
+    stream, tracks, names, before = broken
     camera = fisheye()
-    stream = CameraStream("front", tracks.timestamps_ns, StampedDots(tracks, names), 640, 480, camera)
-    before = estimate_monocular(tracks, camera)
     assert before.counts.segments == 2
     loops = find_loops(stream, tracks, camera, before, LoopOptions(min_gap_s=0.5, words=32))
     assert len(loops.frames)
@@ -68,23 +74,17 @@ def test_joined_tracks_keep_one_observation_per_frame():
     assert np.isin(tracks.track_ids[others], joined.track_ids).all()
 
 
-def test_without_repeated_places_there_are_no_loops():
-    tracks, names = broken_tracks()
-    camera = fisheye()
-    stream = CameraStream("front", tracks.timestamps_ns, StampedDots(tracks, names), 640, 480, camera)
-    visual = estimate_monocular(tracks, camera)
-    loops = find_loops(stream, tracks, camera, visual, LoopOptions(min_gap_s=3600.0, words=32))
+def test_without_repeated_places_there_are_no_loops(broken):
+    stream, tracks, _, visual = broken
+    loops = find_loops(stream, tracks, fisheye(), visual, LoopOptions(min_gap_s=3600.0, words=32))
     assert loops.frames.shape == (0, 2)
     np.testing.assert_array_equal(joined_tracks(tracks, loops.track_ids).track_ids, tracks.track_ids)
 
 
 @pytest.mark.parametrize("count", [0, 5])
-def test_too_few_descriptors_are_no_loops(count):
-    tracks, names = broken_tracks()
-    camera = fisheye()
-    visual = estimate_monocular(tracks, camera)
+def test_too_few_descriptors_are_no_loops(broken, count):
+    stream, tracks, _, visual = broken
     rows = np.flatnonzero(visual.inliers)[count:]
     inliers = visual.inliers.copy()
     inliers[rows] = False
-    stream = CameraStream("front", tracks.timestamps_ns, StampedDots(tracks, names), 640, 480, camera)
-    assert len(find_loops(stream, tracks, camera, replace(visual, inliers=inliers)).frames) == 0
+    assert len(find_loops(stream, tracks, fisheye(), replace(visual, inliers=inliers)).frames) == 0

@@ -14,7 +14,7 @@ from rigwake.odometry.options import OdometryOptions
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
-FRAMES = 120
+FRAMES = 100
 
 
 def truth(tracks: Tracks, world_from_cam: SE3) -> Trajectory:
@@ -37,22 +37,24 @@ def test_recovers_the_path_up_to_scale_with_points_beyond_90_degrees():
     assert len(result.trajectory) == FRAMES
     assert not result.trajectory.is_metric
     assert result.counts.segments == 1
-    assert error.rmse_m < 0.01 * 15  # 1 % of the path
+    assert error.rmse_m < 0.01 * 12.5  # 1 % of the path
     assert error.rotation_rmse_deg < 0.3
     assert result.counts.inlier_rms_px == pytest.approx(0.2 * np.sqrt(2), rel=0.1)
     assert result.inliers.mean() > 0.85
 
 
+@pytest.mark.slow
 def test_wandering_tracks_are_not_inliers():
     world_from_cam, camera = circling(FRAMES), fisheye()
-    tracks = tracks_of(world_from_cam, camera, wrong_share=0.4, points=800)
+    tracks = tracks_of(world_from_cam, camera, wrong_share=0.4, points=600)
     result = estimate_monocular(tracks, camera)
     error = absolute_error(truth(tracks, world_from_cam), result.trajectory, alignment="sim3")
     assert len(result.trajectory) == FRAMES
-    assert error.rmse_m < 0.02 * 15
+    assert error.rmse_m < 0.02 * 12.5
     assert set(result.landmarks.track_ids) <= set(tracks.track_ids)
 
 
+@pytest.mark.slow
 def test_inliers_are_rows_of_the_tracks_as_given():
     world_from_cam, camera = circling(60), fisheye()
     tracks = tracks_of(world_from_cam, camera, wrong_share=0.2)
@@ -64,7 +66,7 @@ def test_inliers_are_rows_of_the_tracks_as_given():
 
 def test_an_outage_makes_two_segments_each_right_in_itself():
     world_from_cam, camera = circling(FRAMES), fisheye()
-    tracks = without_frames(tracks_of(world_from_cam, camera), 55, 65)
+    tracks = without_frames(tracks_of(world_from_cam, camera), 45, 55)
     result = estimate_monocular(tracks, camera)
     assert result.counts.segments == 2
     assert result.counts.empty == 11
@@ -72,7 +74,7 @@ def test_an_outage_makes_two_segments_each_right_in_itself():
     assert segments is not None
     for segment in (0, 1):
         piece = result.trajectory.take(segments == segment)
-        assert len(piece) >= 50
+        assert len(piece) >= 30
         error = absolute_error(truth(tracks, world_from_cam), piece, alignment="sim3")
         assert error.rmse_m < 0.1
 
