@@ -124,7 +124,8 @@ def _see(
     for _ in range(4 if readout > 0 else 0):
         row = np.clip(np.nan_to_num(pixels[:, 1]), 0, camera.height_px - 1) / (camera.height_px - 1)
         poses = _world_from_cam(simulation, camera, times[frame] + row * readout)
-        pixels, valid = model.project(poses.inverse() * points_world)
+        pixels, still = model.project(poses.inverse() * points_world)
+        valid &= still  # a point that leaves the field of view on the way has no row to be seen from
     edge = np.array([camera.width_px - 0.5, camera.height_px - 0.5])
     inside = valid & np.all((pixels >= -0.5) & (pixels <= edge), axis=1)
     return pixels, inside
