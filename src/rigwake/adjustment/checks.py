@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rigwake.adjustment.cross_camera import camera_from_world
+from rigwake.adjustment.gauge import with_gauge
 from rigwake.adjustment.values import AdjustmentOptions
 from rigwake.adjustment.verdicts import ReferenceFrame, calibrated_cameras
 from rigwake.bundle.covariance import covariance_of
@@ -58,8 +59,10 @@ def part_of(problem: RigProblem, first: int, last: int, min_observations: int) -
     inertial = states.inertial
     if inertial is not None:
         inertial = InertialStates(*(getattr(inertial, name)[inside] for name in vars(inertial)))
-    return replace(
+    cut = replace(
         problem,
+        poses=None,
+        distances=(),
         states=States(stamps, states.world_from_rig[inside], inertial),
         landmarks=problem.landmarks.take(kept),
         observations=Observations(
@@ -70,6 +73,7 @@ def part_of(problem: RigProblem, first: int, last: int, min_observations: int) -
             part.std_px,
         ),
     )
+    return with_gauge(cut)
 
 
 def split_half(

@@ -11,13 +11,15 @@ import numpy as np
 from rigwake.bundle.covariance import RigCovariance
 from rigwake.bundle.problem import BundleCamera, RigSolution
 from rigwake.calibration import CalibratedCamera, Calibration
-from rigwake.errors import UsageError
+from rigwake.calibration.values import UndeterminedDirection
+from rigwake.errors import UnobservableError, UsageError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
 from rigwake.handeye.observability import open_directions
 
 _OPEN_ROTATION, _OPEN_TRANSLATION = np.deg2rad(50.0), 10.0  # stands for "not at all" in a covariance
+_GIVE_SCALE = "Give a scale: an IMU, GNSS, a known baseline (--prior), or metric --trajectories."
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +27,13 @@ class ReferenceFrame:
     """The frame that the cameras are reported in.
 
     name: `imu`, `base_link` or a camera's. reference_from_rig: exact, for a frame known to sit on the rig; None
-    when the reference is one of the cameras, whose own uncertainty then counts.
+    when the reference is one of the cameras, whose own uncertainty then counts. is_metric: whether anything gave a
+    scale.
     """
 
     name: str
     reference_from_rig: SE3 | None
+    is_metric: bool = True
 
 
 def calibrated_cameras(
@@ -51,6 +55,12 @@ def calibrated_cameras(
             remedy=f"Choose imu, base_link or one of: {', '.join(cameras)}.",
         )
     others = [name for name in cameras if name != reference.name]
+    if not others:
+        raise UnobservableError(
+            f"Of all cameras only {reference.name} is left, the one that the others were to be seen from.",
+            consequence="There is nothing to calibrate.",
+            remedy="Use an IMU or GNSS, or see to it that the other cameras' motion can be estimated.",
+        )
     mounted = {name: _seen_from(reference, cameras, name) for name in others}
     rows = np.concatenate([_rows(covariance, reference, cameras, mounted, name) for name in others])
     joint = _with_open_directions(covariance, rows)
@@ -63,7 +73,7 @@ def calibrated_cameras(
             name=name,
             rig_from_cam=mounted[name],
             covariance=block,
-            undetermined=open_directions(reference.name, name, mounted[name], block, turns),
+            undetermined=_undetermined(reference, name, mounted[name], block, turns),
             time_offset_s=offset,
             time_offset_std_s=offset_std,
             model=cameras[name].model,
@@ -75,6 +85,23 @@ def calibrated_cameras(
         joint = np.block([[np.zeros((6, 6)), np.zeros((6, len(joint)))], [np.zeros((len(joint), 6)), joint]])
     antenna, antenna_covariance = _antenna(solution, covariance, reference)
     return Calibration(reference.name, found, joint, antenna, antenna_covariance)
+
+
+def _undetermined(
+    reference: ReferenceFrame, name: str, reference_from_cam: SE3, covariance: Array, turns: Array
+) -> tuple[UndeterminedDirection, ...]:
+    """What the motion leaves open, and every offset where nothing gave a scale."""
+    found = open_directions(reference.name, name, reference_from_cam, covariance, turns)
+    if reference.is_metric:
+        return found
+    turning = tuple(direction for direction in found if np.any(direction.direction[:3]))
+    unscaled = tuple(
+        UndeterminedDirection(
+            direction, f"{name}: offset along {axis} of {reference.name}, for want of a scale", _GIVE_SCALE
+        )
+        for axis, direction in zip("xyz", np.eye(6)[3:], strict=True)
+    )
+    return turning + unscaled
 
 
 def _the_reference_itself(

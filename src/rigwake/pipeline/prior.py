@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
+from rigwake.adjustment.gauge import with_gauge
 from rigwake.adjustment.start import FirstRig
 from rigwake.bundle.problem import (
     BundleCamera,
+    CameraBaseline,
     CameraParameter,
-    DistanceMeasurement,
-    PoseMeasurements,
     PosePrior,
     RigProblem,
     VectorPrior,
@@ -36,7 +36,6 @@ from rigwake.readers.truth import read_yaml_mapping
 from rigwake.trajectory import Trajectory
 
 _FIXED_STD = 1e-7  # radians or metres: what a fixed degree of freedom is held with
-_SCALE_STD = 0.005  # share: what the scale of a foreign metric trajectory is trusted with
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,33 +72,27 @@ class RigPrior:
             cameras[name] = _prepared(camera, self.cameras.get(name), config)
         return replace(first, start=replace(first.start, cameras=cameras))
 
-    def constrained(self, problem: RigProblem, first: FirstRig) -> RigProblem:
-        """The problem with the antenna's prior and with the gauge held that no sensor determines."""
+    def constrained(self, problem: RigProblem) -> RigProblem:
+        """The problem with what is known of antenna and baselines, and with the gauge held that nothing determines."""
         if self.antenna is not None:
             problem = replace(problem, antenna=replace(problem.antenna, prior=self.antenna))
-        if problem.gnss is not None:
-            return problem
-        states = problem.states
-        if problem.imu is not None:
-            # gravity gives roll and pitch; heading and position are free
-            std = np.array([1.0, 1.0, 1e-4, 1e-4, 1e-4, 1e-4])
-            axes = np.kron(np.eye(2), states.world_from_rig.rotation[0])
-            covariance = axes.T @ np.diag(std**2) @ axes
-            return replace(
-                problem,
-                poses=PoseMeasurements(np.array([0]), states.world_from_rig[:1], covariance[None]),
-            )
-        fixed = np.zeros(len(states), dtype=bool)
-        fixed[0] = True
-        problem = replace(problem, states=replace(states, fixed=fixed))
-        reach = np.linalg.norm(
-            states.world_from_rig.translation - states.world_from_rig.translation[0], axis=1
+        names = [camera.name for camera in problem.cameras]
+        known = tuple(
+            _along_baseline(problem, baseline)
+            for baseline in self.baselines
+            if baseline.first in names and baseline.second in names
         )
-        farthest = int(reach.argmax())
-        distance = float(reach[farthest])
-        return replace(
-            problem, distances=(DistanceMeasurement(0, farthest, distance, _SCALE_STD * distance),)
-        )
+        return with_gauge(replace(problem, baselines=known))
+
+
+def _along_baseline(problem: RigProblem, baseline: Baseline) -> CameraBaseline:
+    """The known distance, along where the second camera is seen from the first: rotation and sides stay free."""
+    a, b = problem.camera_index(baseline.first), problem.camera_index(baseline.second)
+    a_from_b = problem.cameras[a].rig_from_cam.inverse() * problem.cameras[b].rig_from_cam
+    length = float(np.linalg.norm(a_from_b.translation))
+    along = np.concatenate([np.zeros(3), a_from_b.rotation.T @ a_from_b.translation / length])
+    measured = SE3(a_from_b.rotation, a_from_b.translation * (baseline.distance_m / length))
+    return CameraBaseline(a, b, PosePrior(measured, np.outer(along, along) / baseline.std_m**2))
 
 
 def _prepared(camera: BundleCamera, prior: PosePrior | None, config: CalibrateConfig) -> BundleCamera:

@@ -83,7 +83,9 @@ def estimate_rig(
     )
     adjusted, handed_over = _adjust(measurements, first, prior, selection, config, masks, tell)
     tell("checking", 0.8)
-    reference = reference_frame(recording, selection, first, config.reference)
+    reference = replace(
+        reference_frame(recording, selection, first, config.reference), is_metric=first.scale_source != "none"
+    )
     calibration = _conclude(selection, first, adjusted, handed_over, reference, config)
     return RigEstimate(calibration, adjusted, handed_over)
 
@@ -99,7 +101,7 @@ def _adjust(
 ) -> tuple[AdjustedRig, HandOver]:
     """The rig adjustment: alone first, then with landmarks handed over between cameras and times."""
     assembled = assemble_problem(measurements, first.start, config.adjustment)
-    assembled = replace(assembled, problem=prior.constrained(assembled.problem, first))
+    assembled = replace(assembled, problem=prior.constrained(assembled.problem))
     tell(f"adjusting {len(assembled.problem.observations)} observations", 0.0)
     adjusted = adjust(assembled, config.adjustment)
     if not config.adjustment.cross_camera:
@@ -130,10 +132,10 @@ def _conclude(
         numbers |= {"noise_factor": adjusted.noise_factors[name], "dropped": adjusted.dropped[name]}
     topics = {name: stream.topic for name, stream in selection.cameras.items()}
     calibration = calibrated_cameras(solution, covariance, reference, statistics, topics)
-    if not any(camera.determined_axes.any() for camera in calibration.cameras.values()):
+    others = [camera for name, camera in calibration.cameras.items() if name != reference.name]
+    if not any(camera.determined_axes.any() for camera in others):
         raise UnobservableError(
-            "The motion determined nothing of any camera.",
-            remedy=next(iter(calibration.cameras.values())).undetermined[0].remedy,
+            "The motion determined nothing of any camera.", remedy=others[0].undetermined[0].remedy
         )
     return calibration.with_checks(
         residuals=statistics,
