@@ -81,11 +81,12 @@ def _evaluate(
     a, b = observations.common(first, second)
     bearings = observations.bearings[a], observations.bearings[b]
     gate = options.gate_px * float(np.median(observations.rad_per_px[a]))
+    view = relative_pose(*bearings, max_angle=gate, rng=rng)
     if rotations is not None:
+        # the gyro's mounting is known to a degree or so only: what it finds must explain more than vision alone
         R = rotations[second].T @ rotations[first]
-        view = relative_pose_known_rotation(R, *bearings, max_angle=gate, rng=rng)
-    else:
-        view = relative_pose(*bearings, max_angle=gate, rng=rng)
+        aided = relative_pose_known_rotation(R, *bearings, max_angle=gate, rng=rng)
+        view = aided if aided.inliers.sum() > view.inliers.sum() else view
     good = view.inliers & (view.parallax > options.min_parallax_stds * observations.angle_std[a])
     share = float(view.inliers.mean())
     return StartPair(first, second, view, int(good.sum() * (share > options.min_inlier_share)))
