@@ -140,7 +140,7 @@ def raft_motion(field: WaveField, hull: HullResponse, times_s: Array, planar: Ar
     felt = np.abs(amplitude) * wavenumber * np.minimum(1, (wavenumber * half_b) ** -2.0)
     order = np.argsort(felt)[::-1]
     power = np.cumsum(felt[order] ** 2)
-    if power[-1] == 0:
+    if not len(power) or power[-1] == 0:
         return np.zeros((len(times_s), 3))
     kept = order[: int(np.searchsorted(power, power[-1] * (1 - 1e-3))) + 1][:1500]
     k, omega, amplitude = k[kept], omega[kept], amplitude[kept]
