@@ -99,7 +99,7 @@ def _normalised_correlation(
     lags = np.arange(-(len(b) - 1), len(a), dtype=np.int64)
 
     def correlate(x: Array, y: Array) -> Array:
-        full = irfft(rfft(x, size) * np.conj(rfft(y, size)), size)
+        full = irfft(x * np.conj(y), size)
         return np.asarray(full[lags])  # negative lags wrap around
 
     def centred(x: Array, known: Array) -> tuple[Array, float]:
@@ -107,11 +107,12 @@ def _normalised_correlation(
         return x, float(np.sum(x * x) / max(known.sum(), 1.0))
 
     (a, variation_a), (b, variation_b) = centred(a, known_a), centred(b, known_b)
-    n = np.maximum(np.round(correlate(known_a, known_b)), 1.0)
-    sum_a, sum_b = correlate(a, known_b), correlate(known_a, b)
-    covariance = correlate(a, b) - sum_a * sum_b / n
-    variance_a = correlate(a * a, known_b) - sum_a**2 / n
-    variance_b = correlate(known_a, b * b) - sum_b**2 / n
+    F_a, F_b, F_known_a, F_known_b = (rfft(x, size) for x in (a, b, known_a, known_b))
+    n = np.maximum(np.round(correlate(F_known_a, F_known_b)), 1.0)
+    sum_a, sum_b = correlate(F_a, F_known_b), correlate(F_known_a, F_b)
+    covariance = correlate(F_a, F_b) - sum_a * sum_b / n
+    variance_a = correlate(rfft(a * a, size), F_known_b) - sum_a**2 / n
+    variance_b = correlate(F_known_a, rfft(b * b, size)) - sum_b**2 / n
     # lags whose overlap holds hardly any variation correlate by rounding and chance
     usable = n >= MIN_OVERLAP * min(known_a.sum(), known_b.sum())
     for variance, variation in ((variance_a, variation_a), (variance_b, variation_b)):

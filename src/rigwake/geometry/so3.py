@@ -23,6 +23,12 @@ def hat(vectors: ArrayLike) -> Array:
     return out
 
 
+def _vee(matrices: Array) -> Array:
+    """Twice the axial vector of the skew part: (..., 3, 3) -> (..., 3)."""
+    skew = matrices - np.swapaxes(matrices, -1, -2)
+    return np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
+
+
 def _coefficients(angle: Array) -> tuple[Array, Array, Array]:
     """`sin(t)/t`, `(1 - cos t)/t^2`, `(t - sin t)/t^3`, accurate through t = 0."""
     small = angle < _SMALL
@@ -44,8 +50,14 @@ def exp(rotation_vectors: ArrayLike) -> Array:
 
 def log(rotations: ArrayLike) -> Array:
     """Rotation vectors of rotation matrices, angle in [0, pi]: (..., 3, 3) -> (..., 3)."""
-    q = quat_wxyz_from_matrix(rotations)
-    w, v = q[..., 0], q[..., 1:]
+    R = np.asarray(rotations, dtype=np.float64)
+    trace = np.einsum("...ii->...", R)
+    if np.all(trace > 0):  # below 120 degrees the real part is large: no need to look for a larger one
+        w = 0.5 * np.sqrt(1 + trace)
+        v = _vee(R) / (4 * w[..., None])
+    else:
+        q = quat_wxyz_from_matrix(R)
+        w, v = q[..., 0], q[..., 1:]
     norm = np.linalg.norm(v, axis=-1)
     safe = np.where(norm < 1e-12, 1.0, norm)
     factor = np.where(norm < 1e-12, 2.0, 2 * np.arctan2(norm, w) / safe)

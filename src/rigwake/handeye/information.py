@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake.geometry.so3 import Array
+from rigwake.handeye import kernels
 from rigwake.handeye import noise as noise_model
 from rigwake.handeye.motions import Layout, Linearised, Mounting, Steps, feigned_information, linearise
 from rigwake.handeye.noise import Jitter, StepNoise
@@ -122,13 +123,13 @@ def _add(
 ) -> None:
     weighted = _times(group.inverse, r) * rho[:, None]
     for i, m in enumerate(group.members):
-        J = jacobians[m][group.steps]
         mine = slice(6 * i, 6 * i + 6)
-        scores[group.steps, columns[m]] = _times(np.swapaxes(J, 1, 2), weighted[:, mine])
+        kernels.normal_scores(
+            jacobians[m], np.ascontiguousarray(weighted[:, mine]), group.steps, scores[:, columns[m]]
+        )
         for j, n in enumerate(group.members[: i + 1]):
-            block = group.inverse[:, mine, 6 * j : 6 * j + 6]
-            WK = (block @ jacobians[n][group.steps]) * rho[:, None, None]
-            H = J.reshape(-1, J.shape[2]).T @ WK.reshape(-1, WK.shape[2])
+            W = np.ascontiguousarray(group.inverse[:, mine, 6 * j : 6 * j + 6])
+            H = kernels.normal_block(jacobians[m], jacobians[n], W, rho, group.steps)
             information[columns[m], columns[n]] += H
             if i != j:
                 information[columns[n], columns[m]] += H.T

@@ -28,6 +28,7 @@ from rigwake.handeye.resample import Sampled
 
 MIN_STEPS = 4
 _WEAK = 1e-3  # of the best excited direction: left at zero here, the likelihood decides
+_NOISE_FACTOR = 2.0
 _MAX_MOTIONS = 5000
 
 
@@ -134,10 +135,11 @@ def _with_translation(motions: _Motions, rotation: Array, layout: Layout, segmen
     """Translation and scales of a given rotation by linear least squares."""
     lever = np.eye(3) - motions.reference.rotation
     way = motions.member.translation @ rotation.T
+    weak = _noise_share(motions, rotation, lever)
     scales = np.ones(segments)
     if not layout.scale_count:
         right = (motions.reference.translation - way).ravel()
-        translation = np.linalg.lstsq(lever.reshape(-1, 3), right, rcond=_WEAK)[0]
+        translation = np.linalg.lstsq(lever.reshape(-1, 3), right, rcond=weak)[0]
         return SE3(rotation, np.asarray(translation, dtype=np.float64)), scales
     by_segment = np.zeros((*way.shape, segments))
     by_segment[np.arange(len(way)), :, motions.segments] = way
@@ -147,11 +149,22 @@ def _with_translation(motions: _Motions, rotation: Array, layout: Layout, segmen
     unit = np.where(present, ratio, 1.0)
     system = np.concatenate([lever, by_segment[:, :, present] * unit[present]], axis=2)
     solution = np.linalg.lstsq(
-        system.reshape(-1, system.shape[2]), motions.reference.translation.ravel(), rcond=_WEAK
+        system.reshape(-1, system.shape[2]), motions.reference.translation.ravel(), rcond=weak
     )[0]
     # a scale cannot be negative; such a candidate fits badly and loses
     scales[present] = np.maximum(solution[3:], 1e-3) * unit[present]
     return SE3(rotation, solution[:3]), scales
+
+
+def _noise_share(motions: _Motions, rotation: Array, lever: Array) -> float:
+    """Singular values of the levers `I - R_A` up to here, as a share of the largest, may be noise alone.
+
+    What the rotations of both sides disagree by tells the noise; taken at its word, it would put the member
+    hundreds of metres away when the vehicle does not turn.
+    """
+    disagreement = motions.reference.rotation @ rotation - rotation @ motions.member.rotation
+    largest = float(np.linalg.norm(lever.reshape(-1, 3), 2))
+    return max(_WEAK, _NOISE_FACTOR * float(np.linalg.norm(disagreement)) / max(largest, 1e-300))
 
 
 def _misfit(motions: _Motions, X: SE3, scales: Array) -> float:

@@ -17,6 +17,7 @@ from rigwake.geometry.so3 import Array
 from rigwake.handeye.information import (
     USEFUL_CLOCK,
     USEFUL_ROTATION,
+    USEFUL_TRANSLATION,
     Equations,
     determined,
     doubt_of,
@@ -31,7 +32,7 @@ from rigwake.handeye.values import HandeyeOptions
 _MOVES_LESS = 1e-3  # of a standard deviation: converged
 _SETTLED = 0.3  # of a standard deviation: near enough to learn the noise from the residuals
 _PATIENCE = 15  # steps
-_LONGEST_TURN = 0.5  # radians in one step
+_LONGEST_TURN, _LONGEST_WAY = 0.5, 20.0  # radians, metres in one step
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +90,8 @@ class _Solver:
 
     def step(self, doubt: float) -> float:
         """One Gauss-Newton step; its length in standard deviations."""
-        equations = self.equations()
-        tangent, moved = _bounded_step(equations, useful_units(self.problem.layouts), doubt)
+        self.latest = self.equations()
+        tangent, moved = _bounded_step(self.latest, useful_units(self.problem.layouts), doubt)
         ends = np.cumsum([layout.size for layout in self.problem.layouts])
         parts = np.split(tangent, ends[:-1])
         moves = zip(self.mountings, parts, self.problem.layouts, strict=True)
@@ -119,7 +120,7 @@ def maximise(problem: HandeyeProblem, start: Sequence[Mounting], options: Handey
             doubt, enough = 2 * doubt, 10 * enough
     return Estimate(
         solver.mountings,
-        solver.equations(),
+        solver.latest if moved <= enough else solver.equations(),
         solver.residuals,
         solver.valid,
         solver.filters,
@@ -139,6 +140,7 @@ def _bounded_step(equations: Equations, units: Array, doubt: float) -> tuple[Arr
     step = basis @ coefficients
     limits = np.full(len(units), np.inf)
     limits[units == USEFUL_ROTATION] = _LONGEST_TURN
+    limits[units == USEFUL_TRANSLATION] = _LONGEST_WAY
     limits[units == USEFUL_CLOCK] = USEFUL_CLOCK
     shorten = min(1.0, float(np.min(limits / np.maximum(np.abs(step), 1e-300))))
     return step * shorten, float(np.linalg.norm(coefficients))

@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array, hat
-from rigwake.handeye.resample import Sampled, small_adjoint
+from rigwake.geometry.so3 import Array
+from rigwake.handeye import kernels
+from rigwake.handeye.resample import Sampled
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,21 +118,32 @@ def steps_between(reference: Sampled, member: Sampled, absolute: bool) -> Steps:
 
 
 def _motions(world_from_body: SE3) -> SE3:
-    return world_from_body[:-1].inverse() * world_from_body[1:]
+    return SE3(*kernels.motions(world_from_body.rotation, world_from_body.translation))
 
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Jacobians (N, 6, size) of the residuals, zero where not valid, and (N, 6, 6) Ad(C^-1)."""
+    """Of N steps, zero where not valid: Jacobians (N, 6, size) of the residuals; (N, 6, 6) Ad(C^-1) of the
+    agreed motions C, and their translations (N, 3) in the moved frame, `R_C^T t_C`."""
 
     jacobians: Array
     adjoints: Array
+    ways: Array
 
 
 def residuals(steps: Steps, mounting: Mounting) -> Array:
     """`log(B^-1 Y^-1 A X)` of every step, zero where not valid: (N, 6)."""
-    r = (_scaled(steps, mounting).inverse() * _reference_in_member(steps, mounting)).log()
-    return np.where(steps.valid[:, None], r, 0.0)
+    A, B = steps.reference, steps.member
+    return kernels.residuals(
+        A.rotation,
+        A.translation,
+        B.rotation,
+        B.translation,
+        np.exp(mounting.log_scales),
+        steps.segments,
+        steps.valid,
+        *_frames(mounting),
+    )
 
 
 def linearise(steps: Steps, mounting: Mounting, layout: Layout, reference_errors: Array) -> Linearised:
@@ -139,44 +151,45 @@ def linearise(steps: Steps, mounting: Mounting, layout: Layout, reference_errors
 
     reference_errors: (N, 6) estimated errors of the reference, in the member's tangent: `Ad(X^-1) a`.
     """
-    agreed = _reference_in_member(steps, mounting) * SE3.exp(-reference_errors)
-    Rt = np.swapaxes(agreed.rotation, -1, -2)
-    body_translation = np.einsum("nij,nj->ni", Rt, agreed.translation)
-    adjoints = agreed.inverse().adjoint()
+    A = steps.reference
+    adjoints, ways = kernels.agreed_motions(
+        A.rotation,
+        A.translation,
+        steps.segments,
+        steps.valid,
+        *_frames(mounting),
+        np.ascontiguousarray(reference_errors),
+    )
     J = np.zeros((len(adjoints), 6, layout.size))
-    if layout.world_count:
-        J[:, :, :6] = np.eye(6)
+    J[:, :, :6] = np.eye(6)
+    if not layout.world_count:
+        J[:, :, :6] -= adjoints
+    elif layout.world_count == 1:
+        J[:, :, 6:12] = -adjoints
+    else:
         for world in range(layout.world_count):
             here = steps.segments == world
             J[here, :, 6 + 6 * world : 12 + 6 * world] = -adjoints[here]
-    else:
-        J[:, :, :6] = np.eye(6) - adjoints
     if layout.has_clock:
-        scales = np.exp(mounting.log_scales)[steps.segments, None]
-        after, before = steps.twists_after.copy(), steps.twists_before.copy()
-        after[:, 3:] *= scales
-        before[:, 3:] *= scales
-        J[:, :, layout.clock.start] = after - np.einsum("nij,nj->ni", adjoints, before)
+        unit = np.ones((len(J), 6))
+        unit[:, 3:] = np.exp(mounting.log_scales)[steps.segments, None]
+        before = steps.twists_before * unit
+        J[:, :, layout.clock.start] = steps.twists_after * unit - (adjoints @ before[:, :, None])[..., 0]
     for segment in range(layout.scale_count):
         here = steps.segments == segment
-        J[here, 3:, layout.scales.start + segment] = -body_translation[here]
-    J[~steps.valid] = 0
-    return Linearised(J, adjoints)
+        J[here, 3:, layout.scales.start + segment] = -ways[here]
+    if not steps.valid.all():
+        J[~steps.valid] = 0
+    return Linearised(J, adjoints, ways)
 
 
-def _scaled(steps: Steps, mounting: Mounting) -> SE3:
-    if not mounting.log_scales.any():
-        return steps.member
-    scales = np.exp(mounting.log_scales)[steps.segments, None]
-    return SE3(steps.member.rotation, steps.member.translation * scales)
-
-
-def _reference_in_member(steps: Steps, mounting: Mounting) -> SE3:
-    """`C = Y^-1 A X`, the reference's motion as the member should have seen it."""
+def _frames(mounting: Mounting) -> tuple[Array, Array, Array, Array]:
+    """Y^-1 of every segment (or the one for all) and X, as contiguous rotations and translations."""
     X = mounting.ref_from_member
-    if mounting.worlds is None:
-        return X.inverse() * steps.reference * X
-    return mounting.worlds.inverse()[steps.segments] * steps.reference * X
+    inverse = (X[None] if mounting.worlds is None else mounting.worlds).inverse()
+    parts = (inverse.rotation, inverse.translation, X.rotation, X.translation)
+    R, t, R_X, t_X = (np.ascontiguousarray(part) for part in parts)
+    return R, t, R_X, t_X
 
 
 def feigned_information(
@@ -196,20 +209,15 @@ def feigned_information(
     some = chosen[thinned]
     covariance, W = (x if len(x) == 1 else x[thinned] for x in (errors, weights))
     values, vectors = np.linalg.eigh(covariance)
-    # six independent errors per step, first axis
-    error = np.moveaxis(vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :], 2, 0)
-    segments = steps.segments[some]
-    moved = small_adjoint(error) @ linear.adjoints[some]
-    dJ = np.zeros((6, len(some), 6, layout.size))
-    if not layout.world_count:
-        dJ[..., :6] = moved
-    for world in range(layout.world_count):
-        dJ[..., 6 + 6 * world : 12 + 6 * world] = np.where((segments == world)[:, None, None], moved, 0.0)
-    for segment in range(layout.scale_count):
-        column = layout.scales.start + segment
-        way = linear.jacobians[some, 3:, column]
-        turned = error[..., 3:] + (hat(error[..., :3]) @ way[:, :, None])[..., 0]
-        dJ[..., 3:, column] = -np.where((segments == segment)[:, None], turned, 0.0)
-    WdJ = W @ dJ
-    total = dJ.reshape(-1, layout.size).T @ WdJ.reshape(-1, layout.size)
+    total = kernels.feigned(
+        vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :],
+        np.ascontiguousarray(W),
+        linear.adjoints[some],
+        linear.ways[some],
+        steps.segments[some],
+        layout.world_count,
+        layout.scales.start,
+        layout.size,
+        layout.scale_count,
+    )
     return total * (len(chosen) / len(some))

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array, hat
+from rigwake.handeye import kernels
 from rigwake.handeye.resample import Curve
 
 ROTATION_FLOOR = 1e-9  # rad; nothing is known better than rounding allows
@@ -131,17 +132,17 @@ def _robust_covariance(rows: Array, by_axis: bool) -> Array:
 
 def _robust_mean(squared_lengths: Array) -> float:
     """Mean of `|r|^2` (three Gaussian rows) with the outliers pulled in: starts from the median."""
-    if not len(squared_lengths):
-        return 0.0
-    mean = 3 * float(np.median(squared_lengths)) / _CHI2_MEDIAN
-    limit = _CHI2_LIMIT / 3 * mean
-    return float(np.mean(np.minimum(squared_lengths, limit)))
+    return float(kernels.robust_mean(squared_lengths, _CHI2_MEDIAN, _CHI2_LIMIT))
+
+
+@cache
+def _outlier_limit(dimension: int) -> float:
+    return float(chi2.ppf(1 - OUTLIER_PROBABILITY, dimension))
 
 
 def robust_weights(squared: Array, dimension: int) -> Array:
     """Huber weights that touch one in a thousand steps of Gaussian noise."""
-    limit = chi2.ppf(1 - OUTLIER_PROBABILITY, dimension)
-    return np.asarray(np.sqrt(np.minimum(1.0, limit / np.maximum(squared, 1e-300))))
+    return np.asarray(np.sqrt(np.minimum(1.0, _outlier_limit(dimension) / np.maximum(squared, 1e-300))))
 
 
 @dataclass(frozen=True)
@@ -160,19 +161,12 @@ class Jitter:
         """Filter residuals (N, 6) or Jacobians (N, 6, P) along time."""
         if self.rotation == 0 and self.translation == 0:
             return rows
-        parts = [
-            _innovations(rows[:, :3], self.rotation),
-            _innovations(rows[:, 3:], self.translation),
-        ]
-        return np.concatenate(parts, axis=1)
+        cells = np.ascontiguousarray(rows).reshape(len(rows), 6, -1)
+        return kernels.innovations(cells, self.rotation, self.translation).reshape(rows.shape)
 
 
 _ENOUGH_STEPS = 20_000
 _THETAS = (0.0, 0.2, 0.4, 0.6, 0.7, 0.8, 0.86, 0.9, 0.93, 0.95, 0.965, 0.975, 0.98)
-
-
-def _innovations(rows: Array, theta: float) -> Array:
-    return rows if theta == 0 else np.asarray(lfilter([1.0], [1.0, -theta], rows, axis=0))
 
 
 def fit_jitter(residuals: Array, valid: NDArray[np.bool_]) -> Jitter:
@@ -183,11 +177,17 @@ def fit_jitter(residuals: Array, valid: NDArray[np.bool_]) -> Jitter:
     """
     residuals, valid = residuals[:_ENOUGH_STEPS], valid[:_ENOUGH_STEPS]
     thetas = [theta for theta in _THETAS if theta <= max(0.0, 1 - 10 / max(valid.sum(), 1))]
-    best = []
-    for rows in (residuals[:, :3], residuals[:, 3:]):
-        errors = [_robust_mean(np.sum(_innovations(rows, theta)[valid] ** 2, axis=1)) for theta in thetas]
-        best.append(thetas[int(np.argmin(errors))])
+    cells, best = np.ascontiguousarray(residuals)[:, :, None], []
+    errors = np.array([_squared_innovations(cells, theta)[valid] for theta in thetas])
+    for part in range(2):
+        means = [_robust_mean(np.ascontiguousarray(squared[:, part])) for squared in errors]
+        best.append(thetas[int(np.argmin(means))])
     return Jitter(*best)
+
+
+def _squared_innovations(cells: Array, theta: float) -> Array:
+    """(N, 2) squared lengths of rotation and translation."""
+    return np.asarray((kernels.innovations(cells, theta, theta) ** 2).reshape(-1, 2, 3).sum(axis=2))
 
 
 def noise_over_steps(covariances: Array, curve: Curve, times_s: Array, absolute: bool) -> Array:

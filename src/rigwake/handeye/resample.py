@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array, hat
+from rigwake.geometry.so3 import Array
+from rigwake.handeye import kernels
 from rigwake.trajectory import Trajectory
 
 
@@ -32,10 +33,11 @@ class Curve:
     Between neighbouring poses j and j+1 the body follows `V_j exp(f(a))`, f the cubic Hermite polynomial in
     the tangent space at V_j with the velocities of both poses (Catmull-Rom); it passes through every pose.
 
-    start_ns: the stamp that `times_s` counts from. increments: (N-1, 6) `log(V_j^-1 V_j+1)`.
+    world_from_body: the poses. start_ns: the stamp that `times_s` counts from. increments: (N-1, 6) `log(V_j^-1 V_j+1)`.
     """
 
     trajectory: Trajectory
+    world_from_body: SE3
     start_ns: int
     times_s: Array
     increments: Array
@@ -47,13 +49,15 @@ class Curve:
     def of(cls, trajectory: Trajectory, max_gap_s: float | None = None) -> Curve:
         """Prepare `trajectory`; gaps longer than `max_gap_s` (default: 10 median periods) are not bridged."""
         times = trajectory.times_s
-        poses = trajectory.world_from_body
-        increments = (poses[:-1].inverse() * poses[1:]).log()
+        # contiguous copies: the kernels are compiled for one layout only
+        poses = SE3(trajectory.world_from_body.rotation.copy(), trajectory.world_from_body.translation.copy())
+        increments = kernels.tangents(*kernels.motions(poses.rotation, poses.translation))
         steps = np.diff(times)
         period = float(np.median(steps))
         longest = 10 * period if max_gap_s is None else max_gap_s
         return cls(
             trajectory,
+            poses,
             int(trajectory.timestamps_ns[0]),
             times,
             increments,
@@ -79,35 +83,20 @@ class Curve:
         segment_ids = self.trajectory.segment_ids
         assert segment_ids is not None
         if at_node.all():
-            poses = self.trajectory.world_from_body[nearest]
-            return Sampled(poses, self.twists[nearest], segment_ids[nearest])
+            return Sampled(self.world_from_body[nearest], self.twists[nearest], segment_ids[nearest])
         left = np.where(at_node, np.minimum(nearest, n - 2), np.clip(nearest - 1, 0, n - 2))
         span = times[left + 1] - times[left]
         alpha = np.clip((times_s - times[left]) / span, -0.1, 1.1)
         alpha = np.where(at_node, (nearest > left) * 1.0, alpha)
-        poses = self.trajectory.world_from_body[left] * SE3.exp(self._hermite(left, alpha, span))
-        twists = self.twists[left] + alpha[:, None] * (self.twists[left + 1] - self.twists[left])
+        poses = self.world_from_body
+        rotation, translation, twists = kernels.interpolate(
+            poses.rotation, poses.translation, self.increments, self.twists, left, alpha, span
+        )
         edge = 0.1 * self.period_s
         inside = (times_s >= times[0] - edge) & (times_s <= times[-1] + edge)
         bridged = (span <= self.max_gap_s) & (segment_ids[left] == segment_ids[left + 1])
         known = inside & (bridged | at_node)
-        return Sampled(poses, twists, np.where(known, segment_ids[nearest], -1))
-
-    def _hermite(self, left: NDArray[np.int64], alpha: Array, span: Array) -> Array:
-        a = alpha[:, None]
-        D = self.increments[left]
-        start = self.twists[left] * span[:, None]
-        end = self.twists[left + 1] * span[:, None]
-        end = end + 0.5 * np.einsum("nij,nj->ni", small_adjoint(D), end)  # J_r^-1(D) to first order
-        return D * (3 - 2 * a) * a * a + start * a * (1 - a) ** 2 - end * a * a * (1 - a)
-
-
-def small_adjoint(tangents: Array) -> Array:
-    """`ad(x)` with `ad(x) y = [x, y]`: (..., 6) -> (..., 6, 6)."""
-    ad = np.zeros((*tangents.shape, 6))
-    ad[..., :3, :3] = ad[..., 3:, 3:] = hat(tangents[..., :3])
-    ad[..., 3:, :3] = hat(tangents[..., 3:])
-    return ad
+        return Sampled(SE3(rotation, translation), twists, np.where(known, segment_ids[nearest], -1))
 
 
 def _node_twists(increments: Array, steps: Array) -> Array:
