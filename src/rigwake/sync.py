@@ -19,6 +19,8 @@ from rigwake.geometry import so3
 from rigwake.geometry.so3 import Array
 from rigwake.trajectory import Trajectory
 
+Spectrum = NDArray[np.complex128]
+
 MIN_OVERLAP = 0.3  # of the shorter trajectory: a short overlap correlates by chance
 MIN_CORRELATION = 0.5
 
@@ -98,7 +100,7 @@ def _normalised_correlation(
     size = next_fast_len(len(a) + len(b) - 1, real=True)
     lags = np.arange(-(len(b) - 1), len(a), dtype=np.int64)
 
-    def correlate(x: Array, y: Array) -> Array:
+    def correlate(x: Spectrum, y: Spectrum) -> Array:
         full = irfft(x * np.conj(y), size)
         return np.asarray(full[lags])  # negative lags wrap around
 

@@ -28,7 +28,6 @@ from rigwake.handeye.resample import Sampled
 
 MIN_STEPS = 4
 _WEAK = 1e-3  # of the best excited direction: left at zero here, the likelihood decides
-_NOISE_FACTOR = 2.0
 _MAX_MOTIONS = 5000
 
 
@@ -127,7 +126,7 @@ def _turned_about_axis(motions: _Motions, rotation: Array, turns_b: Array) -> Ar
     columns = np.stack([across, quarter, along], axis=2)
     lever = np.eye(3) - motions.reference.rotation
     system = np.concatenate([columns, lever], axis=2).reshape(-1, 6)
-    solution = np.linalg.lstsq(system, motions.reference.translation.ravel(), rcond=_WEAK)[0]
+    solution = _least_squares(system, motions.reference.translation.ravel(), _lever_noise(motions, rotation))
     return so3.exp(axis * np.arctan2(solution[1], solution[0])) @ rotation
 
 
@@ -135,12 +134,11 @@ def _with_translation(motions: _Motions, rotation: Array, layout: Layout, segmen
     """Translation and scales of a given rotation by linear least squares."""
     lever = np.eye(3) - motions.reference.rotation
     way = motions.member.translation @ rotation.T
-    weak = _noise_share(motions, rotation, lever)
+    noise = _lever_noise(motions, rotation)
     scales = np.ones(segments)
     if not layout.scale_count:
         right = (motions.reference.translation - way).ravel()
-        translation = np.linalg.lstsq(lever.reshape(-1, 3), right, rcond=weak)[0]
-        return SE3(rotation, np.asarray(translation, dtype=np.float64)), scales
+        return SE3(rotation, _least_squares(lever.reshape(-1, 3), right, noise)), scales
     by_segment = np.zeros((*way.shape, segments))
     by_segment[np.arange(len(way)), :, motions.segments] = way
     sizes = np.linalg.norm(by_segment, axis=(0, 1))
@@ -148,23 +146,28 @@ def _with_translation(motions: _Motions, rotation: Array, layout: Layout, segmen
     present = sizes > 0
     unit = np.where(present, ratio, 1.0)
     system = np.concatenate([lever, by_segment[:, :, present] * unit[present]], axis=2)
-    solution = np.linalg.lstsq(
-        system.reshape(-1, system.shape[2]), motions.reference.translation.ravel(), rcond=weak
-    )[0]
+    right = motions.reference.translation.ravel()
+    solution = _least_squares(system.reshape(-1, system.shape[2]), right, noise)
     # a scale cannot be negative; such a candidate fits badly and loses
     scales[present] = np.maximum(solution[3:], 1e-3) * unit[present]
     return SE3(rotation, solution[:3]), scales
 
 
-def _noise_share(motions: _Motions, rotation: Array, lever: Array) -> float:
-    """Singular values of the levers `I - R_A` up to here, as a share of the largest, may be noise alone.
+def _lever_noise(motions: _Motions, rotation: Array) -> float:
+    """Singular values of the stacked levers `I - R_A` up to here may be noise alone.
 
-    What the rotations of both sides disagree by tells the noise; taken at its word, it would put the member
-    hundreds of metres away when the vehicle does not turn.
+    What the rotations of both sides disagree by tells it. Taken at its word, it would put the member hundreds
+    of metres away when the vehicle does not turn.
     """
     disagreement = motions.reference.rotation @ rotation - rotation @ motions.member.rotation
-    largest = float(np.linalg.norm(lever.reshape(-1, 3), 2))
-    return max(_WEAK, _NOISE_FACTOR * float(np.linalg.norm(disagreement)) / max(largest, 1e-300))
+    return float(np.linalg.norm(disagreement))
+
+
+def _least_squares(system: Array, right: Array, noise: float) -> Array:
+    """The solution along the singular directions that stand out of `noise`, zero along the others."""
+    U, values, Vt = np.linalg.svd(system, full_matrices=False)
+    kept = values > max(noise, _WEAK * float(values[0]))
+    return np.asarray(Vt[kept].T @ ((right @ U[:, kept]) / values[kept]))
 
 
 def _misfit(motions: _Motions, X: SE3, scales: Array) -> float:

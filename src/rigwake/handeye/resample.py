@@ -33,7 +33,8 @@ class Curve:
     Between neighbouring poses j and j+1 the body follows `V_j exp(f(a))`, f the cubic Hermite polynomial in
     the tangent space at V_j with the velocities of both poses (Catmull-Rom); it passes through every pose.
 
-    world_from_body: the poses. start_ns: the stamp that `times_s` counts from. increments: (N-1, 6) `log(V_j^-1 V_j+1)`.
+    world_from_body: the poses. start_ns: the stamp that `times_s` counts from.
+    increments: (N-1, 6) `log(V_j^-1 V_j+1)`.
     """
 
     trajectory: Trajectory
