@@ -66,10 +66,17 @@ def form_equations(
     stacked = np.concatenate(residuals, axis=1)
     filtered = np.concatenate([f.apply(r) for f, r in zip(filters, residuals, strict=True)], axis=1)
     groups = _groups(np.stack([s.valid for s in steps], axis=1), noise)
+    weights, used = np.ones(len(stacked)), np.zeros(len(stacked), dtype=bool)
     reference_errors = np.zeros_like(stacked)
     for group in groups:
         here = np.ix_(group.steps, group.rows)
-        reference_errors[here] = _times(group.blame, stacked[here])
+        if robust:
+            r = filtered[here]
+            squared = np.einsum("ni,ni->n", _times(group.inverse, r), r)
+            weights[group.steps] = noise_model.robust_weights(squared, len(group.rows))
+        used[group.steps] = True
+        # what noise cannot explain (an outlier, or a poor start) is not the reference's error either
+        reference_errors[here] = _times(group.blame, stacked[here]) * weights[group.steps, None]
     linear = [
         linearise(s, x, layout, reference_errors[:, 6 * m : 6 * m + 6])
         for m, (s, x, layout) in enumerate(zip(steps, mountings, problem.layouts, strict=True))
@@ -78,13 +85,8 @@ def form_equations(
     columns = _columns(problem.layouts)
     size = columns[-1].stop
     information, scores = np.zeros((size, size)), np.zeros((len(stacked), size))
-    weights, used = np.ones(len(stacked)), np.zeros(len(stacked), dtype=bool)
     for group in groups:
         r = filtered[np.ix_(group.steps, group.rows)]
-        if robust:
-            squared = np.einsum("ni,ni->n", _times(group.inverse, r), r)
-            weights[group.steps] = noise_model.robust_weights(squared, len(group.rows))
-        used[group.steps] = True
         _add(information, scores, group, r, weights[group.steps], jacobians, columns)
     feigned = _feigned(problem, steps, linear, groups, columns)
     return Equations(information, scores, weights, used, feigned)
