@@ -14,8 +14,9 @@ from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.calibration.values import UndeterminedDirection
 from rigwake.errors import UnobservableError, UsageError
 from rigwake.geometry import so3
-from rigwake.geometry.se3 import SE3
+from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
 from rigwake.geometry.so3 import Array
+from rigwake.handeye.information import USEFUL_ROTATION, USEFUL_TRANSLATION
 from rigwake.handeye.observability import open_directions
 
 _OPEN_ROTATION, _OPEN_TRANSLATION = np.deg2rad(50.0), 10.0  # stands for "not at all" in a covariance
@@ -92,16 +93,38 @@ def _undetermined(
 ) -> tuple[UndeterminedDirection, ...]:
     """What the motion leaves open, and every offset where nothing gave a scale."""
     found = open_directions(reference.name, name, reference_from_cam, covariance, turns)
-    if reference.is_metric:
-        return found
-    turning = tuple(direction for direction in found if np.any(direction.direction[:3]))
-    unscaled = tuple(
-        UndeterminedDirection(
-            direction, f"{name}: offset along {axis} of {reference.name}, for want of a scale", _GIVE_SCALE
+    if not reference.is_metric:
+        turning = tuple(direction for direction in found if np.any(direction.direction[:3]))
+        return turning + tuple(
+            UndeterminedDirection(
+                axis, f"{_axis_words(axis, name, reference)}, for want of a scale", _GIVE_SCALE
+            )
+            for axis in np.eye(6)[3:]
         )
-        for axis, direction in zip("xyz", np.eye(6)[3:], strict=True)
+    return found + _drawn_along(found, reference, name, reference_from_cam, covariance)
+
+
+def _drawn_along(
+    found: tuple[UndeterminedDirection, ...],
+    reference: ReferenceFrame,
+    name: str,
+    reference_from_cam: SE3,
+    covariance: Array,
+) -> tuple[UndeterminedDirection, ...]:
+    """Axes that an open direction hardly touches, and yet by more than makes a figure useless: it is that open."""
+    units = np.repeat([USEFUL_ROTATION, USEFUL_TRANSLATION], 3)
+    stds = np.sqrt(np.diag(covariance_in_axes_of_a(reference_from_cam, covariance))) / units
+    named = np.any([direction.direction != 0 for direction in found], axis=0) if found else np.zeros(6, bool)
+    return tuple(
+        UndeterminedDirection(axis, _axis_words(axis, name, reference), found[0].remedy if found else "")
+        for axis in np.eye(6)[(stds > 1.0) & ~named]
     )
-    return turning + unscaled
+
+
+def _axis_words(axis: Array, name: str, reference: ReferenceFrame) -> str:
+    k = int(axis.argmax())
+    kind = "rotation about" if k < 3 else "offset along"
+    return f"{name}: {kind} {'xyz'[k % 3]} of {reference.name}"
 
 
 def _the_reference_itself(
