@@ -15,12 +15,13 @@ from rigwake.bundle.problem import PosePrior
 from rigwake.calibration import Calibration
 from rigwake.config import CalibrateConfig, load_config
 from rigwake.errors import InputError, UnobservableError, UsageError
+from rigwake.fingerprint import input_fingerprint
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
 from rigwake.pipeline.outputs import horizon_pixels
 from rigwake.pipeline.prior import RigPrior, load_prior
 from rigwake.pipeline.selection import select
-from rigwake.pipeline.stage_files import StageLedger, input_fingerprint, stage_key
+from rigwake.pipeline.stage_files import StageLedger, stage_key
 from rigwake.simulate.tracks_only import SimulatedTracks
 
 

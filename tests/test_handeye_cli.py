@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from handeye_scenes import PORT, planar, standstill, wavy
 from rigwake.calibration import load_calibration
 from rigwake.cli.main import main
 from rigwake.geometry.se3 import SE3
+from rigwake.readers.open import open_recording
+from rigwake.writers import trajectories
 
 TIMES = np.arange(200) * 0.1
 
@@ -50,6 +53,36 @@ def test_result_in_json_and_calibration(tmp_path, run):
     assert member["unobservable"] == []
     camera = load_calibration(tmp_path / "calibration.yaml").camera("port")
     assert np.abs(PORT.local(camera.rig_from_cam)).max() < 1e-6
+
+
+def test_provenance_identifies_the_inputs(tmp_path, run):
+    rig = write_tum(tmp_path / "rig.tum", wavy(TIMES))
+    port = write_tum(tmp_path / "port.tum", wavy(TIMES) * PORT)
+    for output in ("first.yaml", "second.yaml"):
+        assert run(rig, port, "-o", tmp_path / output)[0] == 0
+        write_tum(port, wavy(TIMES) * PORT * PORT)
+    first, second = (
+        load_calibration(tmp_path / name).provenance["inputs"] for name in ("first.yaml", "second.yaml")
+    )
+    assert [one["path"] for one in first] == ["rig.tum", "port.tum"]
+    assert first[0] == second[0]
+    assert first[1]["sha256_of_ends"] != second[1]["sha256_of_ends"]
+
+
+def test_pose_topic_of_a_bag(tmp_path, run, real_recordings):
+    """A camera bolted to a real robot that drives on a plane, the robot's odometry in a bag."""
+    bag, topic = real_recordings / "rosbags" / "husky_imu_odom_gps.bag", "/husky_velocity_controller/odom"
+    odometry = open_recording(bag).poses["odom"]
+    camera = replace(odometry, name="port", world_from_body=odometry.world_from_body * PORT, covariances=None)
+    file, output = tmp_path / "port.tum", tmp_path / "calibration.yaml"
+    trajectories.write_tum(camera, file)
+    assert run(f"{bag}:/no/such/topic", file)[0] == 2
+    code, printed = run(f"{bag}:{topic}", file, "--json", "-", "-o", output)
+    assert code == 0
+    offset = json.loads(printed)["members"]["port"]["ref_from_member"]["translation_m"]
+    assert offset[:2] == pytest.approx(PORT.translation[:2], abs=1e-3)
+    assert offset[2] is None
+    assert load_calibration(output).provenance["inputs"][0]["topic"] == topic
 
 
 def test_open_axis_is_null_and_named(tmp_path, run):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,8 +20,8 @@ if TYPE_CHECKING:
 
 
 def command(
-    reference: Annotated[Path, typer.Argument(help="Trajectory of the reference, metric.")],
-    others: Annotated[list[Path], typer.Argument(help="Trajectories of the others, one file each.")],
+    reference: Annotated[str, typer.Argument(help="Trajectory of the reference, metric.")],
+    others: Annotated[list[str], typer.Argument(help="Trajectories of the others, one file each.")],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write calibration.yaml here.")
     ] = None,
@@ -46,7 +47,7 @@ def command(
 ) -> None:
     """Where bodies sit on one rig, from one trajectory of each: no shared view, any clock, any origin.
 
-    Formats: TUM, KITTI, EuRoC, csv with header.
+    Formats: TUM, KITTI, EuRoC, csv with header; pose topics of ROS bags as [cyan]recording.bag:/topic[/cyan].
     Example: [cyan]rigwake handeye imu.tum port.tum starboard.tum -o calibration.yaml[/cyan]
     """
     from rigwake.calibration import save_calibration
@@ -59,7 +60,8 @@ def command(
         raise UsageError(
             f"--noise {noise!r} is unknown.", remedy="Choose auto, estimated, increments or poses."
         )
-    trajectories = [_read(path) for path in (reference, *others)]
+    inputs = [_Input.parse(text) for text in (reference, *others)]
+    trajectories = [_read(one) for one in inputs]
     options = HandeyeOptions(
         method="seed" if method == "seed" else "ml",
         noise=None if noise == "auto" else noise,  # type: ignore[arg-type]
@@ -68,8 +70,13 @@ def command(
     )
     result = calibrate_handeye(trajectories[0], trajectories[1:], options)
     if output is not None:
-        provenance = {"command": "handeye", "inputs": [str(p) for p in (reference, *others)]}
-        save_calibration(result.calibration({**provenance, "method": method, "noise": result.noise}), output)
+        provenance = {
+            "command": "handeye",
+            "inputs": [one.fingerprint() for one in inputs],
+            "method": method,
+            "noise": result.noise,
+        }
+        save_calibration(result.calibration(provenance), output)
     if json_file is not None:
         write_json(json_file, result_to_json(result))
         if str(json_file) == "-":
@@ -78,17 +85,46 @@ def command(
     if output is not None:
         next_step(f"rigwake export {output} --to kalibr -o camchain.yaml", "load it into other tools")
     else:
-        files = " ".join(str(p) for p in (reference, *others))
+        files = " ".join((reference, *others))
         next_step(f"rigwake handeye {files} -o calibration.yaml", "keep the result")
 
 
-def _read(path: Path) -> Trajectory:
+@dataclass(frozen=True)
+class _Input:
+    """A trajectory file, or a pose topic of a recording (`recording.bag:/topic`)."""
+
+    path: Path
+    topic: str | None
+
+    @classmethod
+    def parse(cls, text: str) -> _Input:
+        before, colon, topic = text.rpartition(":/")
+        whole = Path(text)
+        return cls(Path(before), "/" + topic) if colon and not whole.exists() else cls(whole, None)
+
+    def fingerprint(self) -> dict[str, Any]:
+        """What identifies it in the provenance of a calibration."""
+        from rigwake.fingerprint import input_fingerprint
+
+        return input_fingerprint(self.path) | ({"topic": self.topic} if self.topic else {})
+
+
+def _read(source: _Input) -> Trajectory:
+    from rigwake.readers.open import open_recording
+    from rigwake.readers.topics import TopicMap
     from rigwake.readers.trajectories import read_trajectory
 
-    read = read_trajectory(path)
-    for finding in read.findings:
-        err.print(f"[yellow]{escape(path.name)}: {escape(finding.message)}[/yellow]")
-    return read.trajectory
+    if source.topic is None:
+        read = read_trajectory(source.path)
+        trajectory, findings = read.trajectory, read.findings
+    else:
+        name = source.topic.strip("/").replace("/", "_")
+        recording = open_recording(source.path, TopicMap({"pose": {name: source.topic}}))
+        trajectory = recording.poses[name]
+        findings = tuple(f for f in recording.findings if f.sensor == name)
+    for finding in findings:
+        err.print(f"[yellow]{escape(source.path.name)}: {escape(finding.message)}[/yellow]")
+    return trajectory
 
 
 def result_to_json(result: HandeyeResult) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from rigwake.adjustment.start import FirstRig
 from rigwake.calibration import Calibration, save_calibration
 from rigwake.config import CalibrateConfig
 from rigwake.errors import InputError, UnobservableError
+from rigwake.fingerprint import input_fingerprint
 from rigwake.pipeline.camera_stage import (
     CameraJob,
     CameraOutcome,
@@ -27,7 +28,7 @@ from rigwake.pipeline.parallel import Progress, process_cameras
 from rigwake.pipeline.prior import RigPrior
 from rigwake.pipeline.rig_stage import estimate_rig, start_rig
 from rigwake.pipeline.selection import Selection, select
-from rigwake.pipeline.stage_files import StageLedger, input_fingerprint, stage_key
+from rigwake.pipeline.stage_files import StageLedger, stage_key
 from rigwake.readers.open import open_recording
 from rigwake.readers.topics import TopicMap
 from rigwake.readers.trajectories import read_trajectory
