@@ -35,6 +35,10 @@ from rigwake.geometry.so3 import Array
 from rigwake.readers.truth import read_yaml_mapping
 from rigwake.trajectory import Trajectory
 
+_ABOARD_STD_M = (
+    10.0  # as good as nothing, yet it keeps an offset that nothing determines from running away, and
+)
+# with it whatever that offset draws along
 _FIXED_STD = 1e-7  # radians or metres: what a fixed degree of freedom is held with
 
 
@@ -74,8 +78,8 @@ class RigPrior:
 
     def constrained(self, problem: RigProblem) -> RigProblem:
         """The problem with what is known of antenna and baselines, and with the gauge held that nothing determines."""
-        if self.antenna is not None:
-            problem = replace(problem, antenna=replace(problem.antenna, prior=self.antenna))
+        antenna = self.antenna or VectorPrior.from_std(np.zeros(3), np.full(3, _ABOARD_STD_M))
+        problem = replace(problem, antenna=replace(problem.antenna, prior=antenna))
         names = [camera.name for camera in problem.cameras]
         known = tuple(
             _along_baseline(problem, baseline)
@@ -105,11 +109,19 @@ def _prepared(camera: BundleCamera, prior: PosePrior | None, config: CalibrateCo
     return replace(
         camera,
         free=frozenset(free),
-        rig_from_cam_prior=prior,
+        rig_from_cam_prior=prior or _aboard(camera),
         line_delay_s=delay,
         reference_row_px=0.0,
         time_offset_s=camera.time_offset_s if config.time_offsets else 0.0,
     )
+
+
+def _aboard(camera: BundleCamera) -> PosePrior | None:
+    """All that is known of a camera of which nothing is known: it is on the same vessel."""
+    if "rig_from_cam" not in camera.free:
+        return None
+    mean = SE3(camera.rig_from_cam.rotation, np.zeros(3))
+    return PosePrior.in_axes_of_a(mean, np.repeat([np.inf, _ABOARD_STD_M], 3))
 
 
 def _scaled(first: FirstRig, baselines: tuple[Baseline, ...]) -> FirstRig:
