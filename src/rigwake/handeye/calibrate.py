@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
 from rigwake.handeye.information import USEFUL_CLOCK, USEFUL_LOG_SCALE
 from rigwake.handeye.initial import initial_mountings
-from rigwake.handeye.likelihood import Estimate, maximise
+from rigwake.handeye.likelihood import Estimate, information_criterion, maximise
 from rigwake.handeye.motions import Mounting
 from rigwake.handeye.observability import covariance, open_directions
 from rigwake.handeye.problem import HandeyeProblem, pose_problem
@@ -41,6 +42,16 @@ def calibrate_handeye(
     if options.method == "seed":
         return _seed_result(problem, start)
     estimate = maximise(problem, start, options)
+    if problem.noise == "estimated" and any(f.rotation and f.translation for f in estimate.filters):
+        # the poses jitter: perhaps they do not drift at all
+        as_poses = pose_problem(
+            reference, members, replace(options, noise="poses"), [offset is not None for offset in offsets]
+        )
+        other = maximise(as_poses, initial_mountings(as_poses, _offsets(estimate)), options)
+        if other.converged and information_criterion(as_poses, other) < information_criterion(
+            problem, estimate
+        ):
+            problem, estimate = as_poses, other
     if not estimate.converged:
         raise EstimationError(
             f"Hand-eye calibration did not settle within {options.max_iterations} steps.",
@@ -48,6 +59,10 @@ def calibrate_handeye(
             remedy="Look at the trajectories: do they show one rigid body? Try --noise poses or increments.",
         )
     return _result(problem, estimate, options)
+
+
+def _offsets(estimate: Estimate) -> list[float]:
+    return [mounting.time_offset_s for mounting in estimate.mountings]
 
 
 def _clock(reference: Trajectory, member: Trajectory) -> float | None:

@@ -25,7 +25,14 @@ from rigwake.handeye.information import (
     useful_units,
 )
 from rigwake.handeye.motions import Mounting, residuals
-from rigwake.handeye.noise import Jitter, StepNoise, fit_jitter, known_noise, learnt_noise
+from rigwake.handeye.noise import (
+    Jitter,
+    StepNoise,
+    fit_jitter,
+    known_noise,
+    learnt_noise,
+    robust_mean_square,
+)
 from rigwake.handeye.problem import HandeyeProblem, step_covariances
 from rigwake.handeye.values import HandeyeOptions
 
@@ -128,6 +135,24 @@ def maximise(problem: HandeyeProblem, start: Sequence[Mounting], options: Handey
         iterations,
         moved <= enough,
     )
+
+
+def information_criterion(problem: HandeyeProblem, estimate: Estimate) -> float:
+    """Schwarz's criterion (BIC) of learnt noise, lower is better: how well the past predicts each residual.
+
+    Comparable between increments and poses, for increments are the poses' differences: a change of variables
+    of determinant one. Levels are taken alike on all axes, whatever the estimate assumed.
+    """
+    total = 0.0
+    for m, (layout, jitter, r) in enumerate(
+        zip(problem.layouts, estimate.filters, estimate.residuals, strict=True)
+    ):
+        valid = estimate.valid[:, m]
+        predicted = jitter.apply(r)[valid]
+        levels = [robust_mean_square(part) for part in (predicted[:, :3], predicted[:, 3:])]
+        total += 3 * len(predicted) * float(np.sum(np.log(levels)))
+        total += layout.size * np.log(max(len(predicted), 1))
+    return total
 
 
 def _bounded_step(equations: Equations, units: Array, doubt: float) -> tuple[Array, float]:

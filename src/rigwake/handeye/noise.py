@@ -135,6 +135,11 @@ def _robust_mean(squared_lengths: Array) -> float:
     return float(kernels.robust_mean(squared_lengths, _CHI2_MEDIAN, _CHI2_LIMIT))
 
 
+def robust_mean_square(rows: Array) -> float:
+    """Mean of `|r|^2` of rows (N, 3), outliers pulled in, never below what rounding allows."""
+    return _robust_mean(np.sum(rows**2, axis=1)) + ROTATION_FLOOR**2
+
+
 @cache
 def _outlier_limit(dimension: int) -> float:
     return float(chi2.ppf(1 - OUTLIER_PROBABILITY, dimension))

@@ -27,9 +27,9 @@ class HandeyeOptions:
     """How to calibrate.
 
     method: `ml`, or the baseline `seed`.
-    noise: errors independent from increment to increment, from pose to pose, or neither (`estimated`: any
-        stationary correlation in time, learnt from the residuals). None: as the covariances of the
-        trajectories say, else `estimated`.
+    noise: errors independent from increment to increment, from pose to pose, or `estimated`: drift and jitter
+        in shares learnt from the residuals, or poses where these explain the residuals better (BIC).
+        None: as the covariances of the trajectories say, else `estimated`.
     levels: known noise by trajectory name, for trajectories that bring no covariances of their own. Unless
         every trajectory has covariances or a level, the noise is estimated from the residuals.
     time_offset: estimate the clock of every member. scale: also of members that claim to be metric.
