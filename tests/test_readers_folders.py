@@ -134,7 +134,9 @@ def test_a_video_is_read_in_order_and_at_random(tmp_path: Path) -> None:
     assert np.abs(np.array(measured) - levels).max() < 15
     some = list(pickle.loads(pickle.dumps(camera)).frames([2, 3, 90, 99]))
     assert [frame.index for frame in some] == [2, 3, 90, 99]
-    assert [frame.image.mean() for frame in some] == pytest.approx([levels[k] for k in (2, 3, 90, 99)], abs=15)
+    assert [frame.image.mean() for frame in some] == pytest.approx(
+        [levels[k] for k in (2, 3, 90, 99)], abs=15
+    )
     assert some[0].image.shape == (48, 64)
 
 
