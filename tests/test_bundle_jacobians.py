@@ -10,6 +10,7 @@ from bundle_rigs import Wanted, true_problem
 from rigwake.bundle.factors import (
     attitude_factors,
     baseline_factor,
+    camera_distance_factor,
     distance_factor,
     gnss_factors,
     measured_factors,
@@ -22,6 +23,7 @@ from rigwake.bundle.layout import Layout, layout_of, retract, tangent_bases
 from rigwake.bundle.normal import Factors
 from rigwake.bundle.problem import (
     CameraBaseline,
+    CameraDistance,
     DistanceMeasurement,
     Gravity,
     PoseMeasurements,
@@ -136,6 +138,9 @@ def test_baseline_and_priors() -> None:
     mean = (a.rig_from_cam.inverse() * b.rig_from_cam).retract([0.02, 0.01, -0.03, 0.1, 0.2, -0.1])
     baseline = CameraBaseline(0, 1, PosePrior(mean, np.diag([1.0, 2, 3, 4, 5, 0])))
     check(problem, lambda p, layout: [baseline_factor(p, layout, baseline)])
+
+    known = CameraDistance(0, 1, 1.3, 0.02)
+    check(problem, lambda p, layout: [camera_distance_factor(p, layout, known)])
     tape = PosePrior.in_axes_of_a(mean, [np.inf, 0.1, np.inf, 0.02, np.inf, 0.01])
     camera = replace(
         a,

@@ -30,7 +30,7 @@ def with_gauge(problem: RigProblem) -> RigProblem:
     fixed = np.zeros(len(states), dtype=bool)
     fixed[0] = True
     problem = replace(problem, states=replace(states, fixed=fixed))
-    if problem.baselines:
+    if problem.baselines or problem.camera_distances:
         return replace(problem, distances=())
     reach = np.linalg.norm(states.world_from_rig.translation - states.world_from_rig.translation[0], axis=1)
     farthest = int(reach.argmax())

@@ -15,6 +15,7 @@ from rigwake.bundle.motion import at_states, nearest_states, rig_at, seconds_sin
 from rigwake.bundle.normal import Factors
 from rigwake.bundle.problem import (
     CameraBaseline,
+    CameraDistance,
     DistanceMeasurement,
     Indices,
     Mask,
@@ -44,6 +45,8 @@ def measured_factors(problem: RigProblem, layout: Layout, options: SolverOptions
         yield distance_factor(problem, layout, distance)
     for baseline in problem.baselines:
         yield baseline_factor(problem, layout, baseline)
+    for known in problem.camera_distances:
+        yield camera_distance_factor(problem, layout, known)
     yield from _prior_factors(problem, layout)
 
 
@@ -153,11 +156,27 @@ def distance_factor(problem: RigProblem, layout: Layout, measured: DistanceMeasu
 
 def baseline_factor(problem: RigProblem, layout: Layout, baseline: CameraBaseline) -> Factors:
     """A known transform between two cameras."""
-    a, b = problem.cameras[baseline.camera_a], problem.cameras[baseline.camera_b]
-    a_from_b = a.rig_from_cam.inverse() * b.rig_from_cam
-    columns = np.concatenate([layout.shared_columns(x.name, "rig_from_cam", 6) for x in (a, b)])
-    by_step = np.concatenate([-a_from_b.inverse().adjoint(), np.eye(6)], axis=1)
+    a_from_b, by_step, columns = _between(problem, layout, baseline.camera_a, baseline.camera_b)
     return _transform_prior(a_from_b, baseline.prior, by_step, columns)
+
+
+def camera_distance_factor(problem: RigProblem, layout: Layout, known: CameraDistance) -> Factors:
+    """A known distance between two cameras: `d |t| = (R^T t / |t|) . d`, with t, R of `a_from_b`."""
+    a_from_b, by_step, columns = _between(problem, layout, known.camera_a, known.camera_b)
+    length = max(float(np.linalg.norm(a_from_b.translation)), 1e-9)
+    along = a_from_b.rotation.T @ a_from_b.translation / length
+    residuals = np.array([[length - known.distance]])
+    jacobian = (along @ by_step[3:])[None, None]
+    return _whitened(residuals, jacobian, columns[None], np.full((1, 1, 1), 1 / known.std))
+
+
+def _between(problem: RigProblem, layout: Layout, a: int, b: int) -> tuple[SE3, Array, Indices]:
+    """`a_from_b` of two cameras, the derivative (6, 12) of its right tangent by both mountings, their columns."""
+    cameras = problem.cameras[a], problem.cameras[b]
+    a_from_b = cameras[0].rig_from_cam.inverse() * cameras[1].rig_from_cam
+    columns = np.concatenate([layout.shared_columns(x.name, "rig_from_cam", 6) for x in cameras])
+    by_step = np.concatenate([-a_from_b.inverse().adjoint(), np.eye(6)], axis=1)
+    return a_from_b, by_step, columns
 
 
 def _transform_prior(estimate: SE3, prior: PosePrior, by_step: Array, columns: Indices) -> Factors:

@@ -253,6 +253,16 @@ class CameraBaseline:
 
 
 @dataclass(frozen=True, eq=False)
+class CameraDistance:
+    """A known distance between the origins of two cameras, whatever the direction; metres."""
+
+    camera_a: int
+    camera_b: int
+    distance: float
+    std: float
+
+
+@dataclass(frozen=True, eq=False)
 class RigProblem:
     """Least squares over states, landmarks and shared parameters; see the fields' types for units.
 
@@ -278,6 +288,7 @@ class RigProblem:
     relative: tuple[RelativeMeasurements, ...] = ()
     distances: tuple[DistanceMeasurement, ...] = ()
     baselines: tuple[CameraBaseline, ...] = ()
+    camera_distances: tuple[CameraDistance, ...] = ()
 
     def __post_init__(self) -> None:
         if (self.imu is None) != (self.states.inertial is None):

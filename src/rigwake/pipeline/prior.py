@@ -22,7 +22,7 @@ from rigwake.adjustment.gauge import with_gauge
 from rigwake.adjustment.start import FirstRig
 from rigwake.bundle.problem import (
     BundleCamera,
-    CameraBaseline,
+    CameraDistance,
     CameraParameter,
     PosePrior,
     RigProblem,
@@ -82,21 +82,11 @@ class RigPrior:
         problem = replace(problem, antenna=replace(problem.antenna, prior=antenna))
         names = [camera.name for camera in problem.cameras]
         known = tuple(
-            _along_baseline(problem, baseline)
-            for baseline in self.baselines
-            if baseline.first in names and baseline.second in names
+            CameraDistance(names.index(b.first), names.index(b.second), b.distance_m, b.std_m)
+            for b in self.baselines
+            if b.first in names and b.second in names
         )
-        return with_gauge(replace(problem, baselines=known))
-
-
-def _along_baseline(problem: RigProblem, baseline: Baseline) -> CameraBaseline:
-    """The known distance, along where the second camera is seen from the first: rotation and sides stay free."""
-    a, b = problem.camera_index(baseline.first), problem.camera_index(baseline.second)
-    a_from_b = problem.cameras[a].rig_from_cam.inverse() * problem.cameras[b].rig_from_cam
-    length = float(np.linalg.norm(a_from_b.translation))
-    along = np.concatenate([np.zeros(3), a_from_b.rotation.T @ a_from_b.translation / length])
-    measured = SE3(a_from_b.rotation, a_from_b.translation * (baseline.distance_m / length))
-    return CameraBaseline(a, b, PosePrior(measured, np.outer(along, along) / baseline.std_m**2))
+        return with_gauge(replace(problem, camera_distances=known))
 
 
 def _prepared(camera: BundleCamera, prior: PosePrior | None, config: CalibrateConfig) -> BundleCamera:

@@ -16,7 +16,7 @@ from rigwake.adjustment.checks import (
 from rigwake.adjustment.hand_over import HandOver, adjust_with_hand_over
 from rigwake.adjustment.rounds import adjust
 from rigwake.adjustment.start import FirstRig, first_rig
-from rigwake.adjustment.values import AdjustedRig, AssembledProblem, RigMeasurements
+from rigwake.adjustment.values import AdjustedRig, RigMeasurements
 from rigwake.adjustment.verdicts import ReferenceFrame, calibrated_cameras
 from rigwake.bundle.covariance import covariance_of
 from rigwake.calibration import Calibration
@@ -104,10 +104,6 @@ def _adjust(
     assembled = replace(assembled, problem=prior.constrained(assembled.problem))
     tell(f"adjusting {len(assembled.problem.observations)} observations", 0.0)
     adjusted = adjust(assembled, config.adjustment)
-    if prior.baselines:  # along where the cameras are seen from each other now
-        again = prior.constrained(adjusted.solution.problem)
-        assembled = AssembledProblem(again, adjusted.track_cameras, adjusted.track_ids)
-        adjusted = adjust(assembled, replace(config.adjustment, rounds=1))
     if not config.adjustment.cross_camera:
         return adjusted, HandOver.nothing()
     return adjust_with_hand_over(
