@@ -23,6 +23,8 @@ from rigwake.handeye.values import HandeyeOptions, HandeyeResult
 from rigwake.sync import MIN_OVERLAP, estimate_time_offset
 from rigwake.trajectory import Trajectory
 
+_LONGEST_WITHOUT_DRIFT = 20_000  # steps
+
 
 def calibrate_handeye(
     reference: Trajectory, members: Sequence[Trajectory], options: HandeyeOptions | None = None
@@ -42,11 +44,9 @@ def calibrate_handeye(
     if options.method == "seed":
         return _seed_result(problem, start)
     estimate = maximise(problem, start, options)
-    if problem.noise == "estimated" and any(f.rotation and f.translation for f in estimate.filters):
-        # the poses jitter: perhaps they do not drift at all
-        as_poses = pose_problem(
-            reference, members, replace(options, noise="poses"), [offset is not None for offset in offsets]
-        )
+    if problem.noise == "estimated" and _may_be_poses(estimate):
+        has_clock = [offset is not None for offset in offsets]
+        as_poses = pose_problem(reference, members, replace(options, noise="poses"), has_clock)
         other = maximise(as_poses, initial_mountings(as_poses, _offsets(estimate)), options)
         if other.converged and information_criterion(as_poses, other) < information_criterion(
             problem, estimate
@@ -59,6 +59,12 @@ def calibrate_handeye(
             remedy="Look at the trajectories: do they show one rigid body? Try --noise poses or increments.",
         )
     return _result(problem, estimate, options)
+
+
+def _may_be_poses(estimate: Estimate) -> bool:
+    """The poses jitter, and the recording is not so long that a drift unseen in it would matter."""
+    jitters = any(jitter.rotation and jitter.translation for jitter in estimate.filters)
+    return jitters and len(estimate.valid) <= _LONGEST_WITHOUT_DRIFT
 
 
 def _offsets(estimate: Estimate) -> list[float]:
