@@ -1,0 +1,105 @@
+"""The rig of recordings with known truth, by method: seed pipeline, hand-eye only, without and with hand-over.
+
+    python benchmarks/calibrate.py [RECORDING TRUTH]...
+
+Without arguments: `harbour_a` in RIGWAKE_DATA, or in ../shared/data beside the project. Errors are those of the
+worst pair of cameras, which needs no common reference. Seconds and peak memory are of the whole process and its
+children, from images to calibration; `hand-eye only` stops before the adjustment, so it has no figures of its own.
+"""
+
+import os
+import resource
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from rigwake.calibration import Calibration, load_calibration
+from rigwake.config import load_config
+from rigwake.errors import RigwakeError
+from rigwake.evaluate.calibrations import evaluate_calibration
+from rigwake.handeye.calibrate import calibrate_handeye
+from rigwake.handeye.values import HandeyeOptions
+from rigwake.odometry.metric import metric_start
+from rigwake.odometry.seed import estimate_seed
+from rigwake.pipeline.calibrate import calibrate
+from rigwake.pipeline.camera_stage import tracks_file
+from rigwake.readers.open import open_recording
+from rigwake.readers.truth import read_true_rig, rig_in_frame
+from rigwake.rig import Rig
+from rigwake.tracks import load_tracks
+
+DATA = Path(os.environ.get("RIGWAKE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+
+
+def cpu_s() -> float:
+    own, children = (resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime
+
+
+def peak_gb() -> float:
+    return (
+        max(resource.getrusage(w).ru_maxrss for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 2**20
+    )
+
+
+def row(name: str, method: str, found: Calibration | str, truth: Rig, used: str) -> None:
+    if isinstance(found, str):
+        print(f"| {name} | {method} | – | – | {used} {found} |", flush=True)
+        return
+    errors = evaluate_calibration(found, rig_in_frame(truth, found.reference))
+    turn = max(pair.rotation_error_deg for pair in errors.pairs)
+    shift = max(pair.translation_error_m for pair in errors.pairs)
+    print(f"| {name} | {method} | {turn:.3f} | {100 * shift:.1f} | {used} |", flush=True)
+
+
+def seed_pipeline(recording: Path, out: Path) -> Calibration | str:
+    """Frame-to-frame odometry of every camera's tracks, put into metres by GNSS, then the seed's hand-eye."""
+    opened = open_recording(recording)
+    gnss = next(iter(opened.gnss.values()), None)
+    try:
+        paths = [
+            metric_start(estimate_seed(load_tracks(tracks_file(out, name)), stream.model), None, gnss)
+            for name, stream in opened.cameras.items()
+            if stream.model is not None
+        ]
+        metric = [path.world_from_cam for path in paths]
+        return calibrate_handeye(metric[0], metric[1:], HandeyeOptions(method="seed")).calibration()
+    except RigwakeError as error:
+        return str(error.cause)
+
+
+def compare(recording: Path, truth_file: Path) -> None:
+    name, truth = recording.stem, read_true_rig(truth_file)
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        for method, settings in (("ours", ()), ("ours, no hand-over", ("adjustment.cross_camera=false",))):
+            resumed = bool(settings)
+            wall, cpu = time.perf_counter(), cpu_s()
+            try:
+                found: Calibration | str = calibrate(
+                    recording, out, load_config(None, settings), resume=resumed
+                ).calibration
+            except RigwakeError as error:
+                found = str(error.cause)
+            wall, cpu = time.perf_counter() - wall, cpu_s() - cpu
+            tracked = " after tracking" if resumed else f", peak {peak_gb():.2f} GB"
+            row(name, method, found, truth, f"{cpu:.0f} CPU s, {wall:.0f} s{tracked}")
+        row(name, "ours, hand-eye only", load_calibration(out / "initial_rig.yaml"), truth, "")
+        cpu = cpu_s()
+        found = seed_pipeline(recording, out)
+        row(name, "seed pipeline", found, truth, f"{cpu_s() - cpu:.0f} CPU s after tracking")
+
+
+def main() -> None:
+    given = [Path(argument) for argument in sys.argv[1:]]
+    pairs = list(zip(given[::2], given[1::2], strict=True)) or [
+        (DATA / "harbour_a" / "harbour_a.bag", DATA / "harbour_a" / "truth.yaml")
+    ]
+    print("| recording | method | rotation deg | translation cm | used |\n" + "|---" * 5 + "|")
+    for recording, truth in pairs:
+        compare(recording, truth)
+
+
+if __name__ == "__main__":
+    main()
