@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rigwake.adjustment.cross_camera import camera_from_world
+from rigwake.adjustment.cross_camera import predicted_pixels
 from rigwake.adjustment.gauge import with_gauge
 from rigwake.adjustment.values import AdjustmentOptions
 from rigwake.adjustment.verdicts import ReferenceFrame, calibrated_cameras
@@ -111,14 +111,7 @@ def split_half_summary(halves: tuple[Calibration, Calibration] | str) -> dict[st
 def hand_over_errors(solution: RigSolution, unused: Observations) -> dict[str, Any]:
     """Landmarks predicted into images that were not used for them: distances in px, over all and by camera pair."""
     problem = solution.problem
-    points = problem.landmarks.points_world[unused.landmark_indices]
-    distance = np.full(len(unused), np.nan)
-    for index, camera in enumerate(problem.cameras):
-        rows = np.flatnonzero(unused.camera_indices == index)
-        if len(rows):
-            cam_from_world = camera_from_world(problem, index, unused.timestamps_ns[rows])
-            predicted, _ = camera.model.project(cam_from_world * points[rows])
-            distance[rows] = np.linalg.norm(predicted - unused.pixels[rows], axis=1)
+    distance = np.linalg.norm(predicted_pixels(problem, unused) - unused.pixels, axis=1)
     distance_known = np.isfinite(distance)
     first = _first_camera(problem)
     names = [camera.name for camera in problem.cameras]

@@ -94,6 +94,18 @@ def camera_from_world(problem: RigProblem, camera: int, stamps: Indices) -> SE3:
     return (world_from_rig * seen_by.rig_from_cam).inverse()
 
 
+def predicted_pixels(problem: RigProblem, observations: Observations) -> Array:
+    """(M, 2) where the problem's values put the landmarks of observations; NaN outside the lens."""
+    points = problem.landmarks.points_world[observations.landmark_indices]
+    pixels = np.full((len(observations), 2), np.nan)
+    for index, camera in enumerate(problem.cameras):
+        rows = np.flatnonzero(observations.camera_indices == index)
+        if len(rows):
+            cam_from_world = camera_from_world(problem, index, observations.timestamps_ns[rows])
+            pixels[rows], _ = camera.model.project(cam_from_world * points[rows])
+    return pixels
+
+
 def propose_searches(
     solution: RigSolution,
     stamps: Mapping[str, Indices],

@@ -9,13 +9,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.adjustment.cross_camera import HandOverOptions, find_landmarks, propose_searches
-from rigwake.adjustment.rounds import adjust
+from rigwake.adjustment.cross_camera import (
+    HandOverOptions,
+    find_landmarks,
+    predicted_pixels,
+    propose_searches,
+)
+from rigwake.adjustment.rounds import MAD_TO_STD, adjust
 from rigwake.adjustment.values import AdjustedRig, AdjustmentOptions, AssembledProblem
-from rigwake.bundle.problem import Observations
+from rigwake.bundle.problem import Observations, RigSolution
 from rigwake.recording import CameraStream
 from rigwake.tracking.masks import CameraMask, mask_from_file
 
+_FEWEST_TO_WEIGH = 20
 _KEPT_BACK = 7  # the landmarks of every seventh search are only used to check the result
 
 
@@ -64,6 +70,7 @@ def adjust_with_hand_over(
             found, kept_back = found.take(~back), found.take(back)
         else:
             kept_back = Observations.empty()
+        found = _weighed(found, adjusted.solution)
         tell(f"adjusting with {len(found)} observations handed over")
         with_found = AssembledProblem(
             replace(problem, observations=joined(problem.observations, found)),
@@ -75,6 +82,21 @@ def adjust_with_hand_over(
         used += len(found)
         unused = _renumbered(kept_back, before, adjusted)
     return adjusted, HandOver(used, unused)
+
+
+def _weighed(found: Observations, solution: RigSolution) -> Observations:
+    """With the spread that they show about their predictions, where it is larger than promised.
+
+    A patch seen from elsewhere differs from its source by more than noise: its depth, its edges. Only the images
+    can tell by how much.
+    """
+    predicted = predicted_pixels(solution.problem, found)
+    whitened = np.abs(predicted - found.pixels) / found.std_px[:, None]
+    known = np.isfinite(whitened).all(axis=1)
+    if known.sum() < _FEWEST_TO_WEIGH:
+        return found
+    spread = MAD_TO_STD * float(np.median(whitened[known]))
+    return replace(found, std_px=found.std_px * max(spread, 1.0))
 
 
 def _images(observations: Observations, names: list[str]) -> dict[str, NDArray[np.int64]]:

@@ -13,7 +13,7 @@ from rigwake.bundle.solver import solve
 from rigwake.errors import EstimationError
 from rigwake.geometry.so3 import Array
 
-_MAD_TO_STD = 1.4826
+MAD_TO_STD = 1.4826
 _FIRST_GATE = 3.0  # the first round's gate is wider by this factor: the start is still in the residuals
 _MIN_LANDMARKS = 20
 
@@ -67,7 +67,7 @@ def noise_scales(solution: RigSolution) -> Array:
         rows = rows[np.isfinite(rows).all(axis=1)]
         if len(rows) > 10:
             # a landmark takes 3 of the degrees of freedom of its 2n residuals; the median shrugs off outliers
-            scales[index] = max(_MAD_TO_STD * float(np.median(np.abs(rows))), 1e-3)
+            scales[index] = max(MAD_TO_STD * float(np.median(np.abs(rows))), 1e-3)
     return scales
 
 

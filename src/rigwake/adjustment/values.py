@@ -39,7 +39,13 @@ class AdjustmentOptions:
     cross_camera: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("state_rate_hz", "state_rate_without_imu_hz", "tracks_per_second", "gate_stds", "rounds"):
+        for name in (
+            "state_rate_hz",
+            "state_rate_without_imu_hz",
+            "tracks_per_second",
+            "gate_stds",
+            "rounds",
+        ):
             if getattr(self, name) <= 0:
                 raise UsageError(f"adjustment option {name} must be positive, not {getattr(self, name)}.")
         if self.min_observations < 2:
