@@ -37,7 +37,7 @@ def assert_within_sigmas(calibration: Calibration, errors: RigErrors, most: floa
 
 
 def test_the_harbour_with_and_without_landmarks_handed_over(real_recordings: Path, out: Path) -> None:
-    full = run(real_recordings, out, "adjustment.state_rate_hz=4").calibration
+    full = run(real_recordings, out).calibration
     assert (out / "calibration.yaml").is_file()
     errors = errors_of(full, real_recordings)
     assert set(full.cameras) == {"front", "left", "back", "right"}

@@ -63,11 +63,12 @@ def noise_scales(solution: RigSolution) -> Array:
     whitened = solution.residuals_px / observations.std_px[:, None]
     scales = np.ones(len(solution.problem.cameras))
     for index in range(len(scales)):
-        rows = whitened[observations.camera_indices == index]
-        rows = rows[np.isfinite(rows).all(axis=1)]
-        if len(rows) > 10:
-            # a landmark takes 3 of the degrees of freedom of its 2n residuals; the median shrugs off outliers
-            scales[index] = max(MAD_TO_STD * float(np.median(np.abs(rows))), 1e-3)
+        own = (observations.camera_indices == index) & np.isfinite(whitened).all(axis=1)
+        if own.sum() > 10:
+            # each landmark takes 3 of the degrees of freedom; the median shrugs off outliers
+            taken = 3 * len(np.unique(observations.landmark_indices[own])) / (2 * own.sum())
+            spread = MAD_TO_STD * float(np.median(np.abs(whitened[own])))
+            scales[index] = max(spread / np.sqrt(max(1 - taken, 0.25)), 1e-3)
     return scales
 
 

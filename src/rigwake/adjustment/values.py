@@ -30,7 +30,7 @@ class AdjustmentOptions:
     rounds: of solving and dropping. cross_camera: whether landmarks are matched across cameras and time.
     """
 
-    state_rate_hz: float = 2.5
+    state_rate_hz: float = 3.0
     state_rate_without_imu_hz: float = 10.0
     tracks_per_second: int = 60
     min_observations: int = 3
