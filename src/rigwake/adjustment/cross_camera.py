@@ -8,13 +8,16 @@ fixes vertical offsets on calm water.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import os
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigwake.bundle.problem import Observations, RigProblem, RigSolution
+from rigwake.cameras.base import Mask
 from rigwake.errors import UsageError
 from rigwake.geometry.interpolate import interpolate
 from rigwake.geometry.se3 import SE3
@@ -79,7 +82,7 @@ class Searches:
     def __len__(self) -> int:
         return len(self.landmarks)
 
-    def take(self, index: Indices) -> Searches:
+    def take(self, index: Indices | Mask) -> Searches:
         """The chosen searches."""
         return Searches(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
@@ -298,15 +301,17 @@ def find_landmarks(
     searches = searches.take(cut)
     pixels = np.full((len(searches), 2), np.nan)
     std_px = np.full(len(searches), np.nan)
-    for camera, name in enumerate(c.name for c in problem.cameras):
+
+    def look(camera: int, name: str) -> None:
         rows = np.flatnonzero(searches.cameras == camera)
         for coefficients, here in _images(streams[name], searches.stamps[rows]):
-            at = rows[here]
             wanted = np.zeros(len(searches), dtype=bool)
-            wanted[at] = True
-            pixels[at], std_px[at] = _look_around(
-                coefficients, references.take(wanted), shape, searches.take(at), options
+            wanted[rows[here]] = True
+            pixels[wanted], std_px[wanted] = _look_around(
+                coefficients, references.take(wanted), shape, searches.take(wanted), options
             )
+
+    _each_camera(problem, look)
     agreed = np.flatnonzero(np.isfinite(std_px))
     return Observations(
         searches.cameras[agreed],
@@ -321,21 +326,32 @@ def _cut_patches(
     problem: RigProblem, searches: Searches, streams: Mapping[str, CameraStream], shape: PatchShape
 ) -> tuple[References, Indices]:
     """Reference patches of the searches' sources, and which searches have one, in that order."""
-    parts: list[References] = []
-    cut: list[Indices] = []
-    for camera, name in enumerate(c.name for c in problem.cameras):
+    by_camera: dict[int, list[tuple[References, Indices]]] = {}
+
+    def cut_out(camera: int, name: str) -> None:
         rows = np.flatnonzero(searches.source_cameras == camera)
+        own = by_camera.setdefault(camera, [])
         for coefficients, here in _images(streams[name], searches.source_stamps[rows]):
             at = rows[here]
             made, good = make_references(coefficients, searches.source_pixels[at], shape)
-            parts.append(made.take(good))
-            cut.append(at[good])
+            own.append((made.take(good), at[good]))
+
+    _each_camera(problem, cut_out)
+    pieces = [piece for camera in sorted(by_camera) for piece in by_camera[camera]]
+    parts, cut = [part for part, _ in pieces], [rows for _, rows in pieces]
     if not parts:
         return make_references(np.zeros((16, 16), np.float32), np.empty((0, 2)), shape)[0], np.empty(
             0, np.int64
         )
     joined = References(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(References)))
     return joined, np.concatenate(cut)
+
+
+def _each_camera(problem: RigProblem, work: Callable[[int, str], None]) -> None:
+    """Cameras side by side: decoding and registration leave the interpreter to the other threads."""
+    names = [camera.name for camera in problem.cameras]
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, len(names))) as pool:
+        list(pool.map(work, range(len(names)), names))
 
 
 def _images(stream: CameraStream, stamps: Indices) -> Iterator[tuple[Coefficients, Indices]]:

@@ -60,12 +60,13 @@ def adjust_with_hand_over(
     """
     used, unused = 0, Observations.empty()
     for done in range(search.rounds):
+        last = done == search.rounds - 1
         problem = adjusted.solution.problem
         images = _images(problem.observations, [c.name for c in problem.cameras])
         tell(f"looking for landmarks in other cameras, round {done + 1}")
         searches = propose_searches(adjusted.solution, images, _masks(masks_folder, streams), search)
         found = find_landmarks(problem, searches, streams, search)
-        if done == search.rounds - 1:
+        if last:
             back = found.landmark_indices % _KEPT_BACK == 0
             found, kept_back = found.take(~back), found.take(back)
         else:
@@ -78,7 +79,7 @@ def adjust_with_hand_over(
             adjusted.track_ids,
         )
         before = adjusted
-        adjusted = adjust(with_found, replace(options, rounds=2))
+        adjusted = adjust(with_found, replace(options, rounds=2 if last else 1))
         used += len(found)
         unused = _renumbered(kept_back, before, adjusted)
     return adjusted, HandOver(used, unused)
