@@ -1,9 +1,9 @@
 """rigwake: calibrate a camera rig from the wake it leaves.
 
-    import rigwake
+import rigwake
 
-    calibration = rigwake.calibrate("sail.bag", "OUT")
-    calibration.camera("front").rig_from_cam.translation
+calibration = rigwake.calibrate("sail.bag", "OUT")
+calibration.camera("front").rig_from_cam.translation
 """
 
 from __future__ import annotations
