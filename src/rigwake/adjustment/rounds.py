@@ -16,6 +16,7 @@ from rigwake.geometry.so3 import Array
 MAD_TO_STD = 1.4826
 _FIRST_GATE = 3.0  # the first round's gate is wider by this factor: the start is still in the residuals
 _MIN_LANDMARKS = 20
+_NEAREST_INVERSE = 1e4  # 1 / units: what is nearer than a tenth of a millimetre is no landmark
 
 
 def adjust(
@@ -86,6 +87,8 @@ def drop_outliers(
     std_px = observations.std_px * scales[observations.camera_indices]
     distance = np.linalg.norm(solution.residuals_px, axis=1) / std_px
     good = np.isfinite(distance) & (distance <= gate_stds)
+    # a robust loss may let go of a landmark altogether: it then falls into its anchor
+    good &= np.abs(problem.landmarks.inverse_ranges[observations.landmark_indices]) < _NEAREST_INVERSE
     counts = np.bincount(observations.landmark_indices[good], minlength=len(problem.landmarks))
     kept = np.flatnonzero(counts >= min_observations)
     if len(kept) < _MIN_LANDMARKS:

@@ -179,7 +179,7 @@ class _Trial:
 def _trial(
     linear: Linearisation, structure: Structure, options: SolverOptions, damping: float
 ) -> _Trial | None:
-    """One damped step, or None if the equations cannot be solved at this damping."""
+    """One damped step, or None if at this damping the equations cannot be solved or the step goes nowhere."""
     layout = structure.layout
     equations, reduced = equations_of(linear, structure, damping)
     try:
@@ -190,7 +190,11 @@ def _trial(
     marks = landmark_steps(linear.observations, reduced, frame_step, step[layout.extras_start :])
     problem = linear.problem
     bases = tangent_bases(problem.landmarks.bearings_world)
-    moved = linearised(retract(problem, layout, step, marks, bases), structure, options)
+    # where next to nothing is determined, a step that is hardly damped may lead beyond all floats
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved = linearised(retract(problem, layout, step, marks, bases), structure, options)
+    if not np.isfinite(moved.cost):
+        return None
     return _Trial(moved, _promised(equations, reduced, step), linear.cost - moved.cost)
 
 
