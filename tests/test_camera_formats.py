@@ -79,6 +79,22 @@ def test_own_form_keeps_the_given_angle_and_only_that() -> None:
     assert camera_from_dict(camera_to_dict(KB4)) == KB4 != limited
 
 
+@pytest.mark.parametrize("camera", CAN_HOLD["rigwake"], ids=lambda camera: camera.model)
+def test_own_form_takes_parameters_in_any_order(camera: CameraModel) -> None:
+    plain = camera_to_dict(camera)
+    turned = {**plain, "params": dict(reversed(plain["params"].items()))}
+    assert camera_from_dict(turned) == camera
+    name = next(iter(plain["params"]))
+    renamed = {("odd" if key == name else key): value for key, value in plain["params"].items()}
+    with pytest.raises(CameraError, match=f"takes the parameters .*{name}.*the file has odd"):
+        camera_from_dict({**plain, "params": renamed})
+    with pytest.raises(CameraError, match="not a number"):
+        camera_from_dict({**plain, "params": {**plain["params"], name: "wide"}})
+    missing = {key: value for key, value in plain["params"].items() if key != name}
+    with pytest.raises(CameraError, match="takes"):
+        camera_from_dict({**plain, "params": missing})
+
+
 def test_ocamcalib_rows_are_first_and_its_pixels_are_ours(tmp_path: Path) -> None:
     text = (
         "#polynomial coefficients for the DIRECT mapping function\n\n5 -200 0 1.8e-3 -1e-6 3e-9\n\n"

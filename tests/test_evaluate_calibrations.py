@@ -4,10 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 
 from rigwake.calibration import CalibratedCamera, Calibration, UndeterminedDirection, save_calibration
 from rigwake.cameras.catalogue import camera_from_params
-from rigwake.cli.main import main
+from rigwake.cli import console
+from rigwake.cli.calibrate import print_calibration
+from rigwake.cli.main import build_app, main
 from rigwake.errors import InputError
 from rigwake.evaluate.calibrations import compare_calibrations, evaluate_calibration
 from rigwake.geometry.se3 import SE3
@@ -138,3 +141,31 @@ def test_commands(
     assert run(monkeypatch, "evaluate", b, "--truth", a, "--gauge", "odd") == 2
     (tmp_path / "other.yaml").write_text("a: 1")
     assert run(monkeypatch, "evaluate", b, "--truth", tmp_path / "other.yaml") == 1
+
+
+def test_tables_fit_a_terminal_of_80_columns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a, b = tmp_path / "a.yaml", tmp_path / "b.yaml"
+    lost = UndeterminedDirection(np.eye(6)[5], "vertical offset of front")
+    moved = calibration({"port": 3 * STD})
+    front = replace(moved.cameras["front"], undetermined=(lost,))
+    save_calibration(calibration(), a)
+    save_calibration(replace(moved, cameras={**moved.cameras, "front": front}), b)
+    monkeypatch.setattr(console.out, "width", 80)
+    assert run(monkeypatch, "evaluate", b, "--truth", a) == 0
+    assert run(monkeypatch, "diff", a, b) == 0
+    print_calibration(replace(moved, cameras={**moved.cameras, "front": front}))
+    shown = [line for line in capsys.readouterr().out.splitlines() if "next:" not in line]
+    assert max(map(len, shown)) <= 80
+    assert "…" not in "".join(shown)
+    rows = [line.split() for line in shown if line.startswith(("port", "front", "aft"))]
+    assert {row[0] for row in rows} == {"front", "port", "aft"}
+    assert len(rows) == 4 * 3  # evaluate, two tables of diff, calibrate: one line per camera each
+    assert "undetermined" in "".join(shown)
+    assert "nan" not in "".join(shown)
+
+
+def test_every_verb_shows_an_example() -> None:
+    for verb, command in typer.main.get_command(build_app()).commands.items():
+        assert f"Example: [cyan]rigwake {verb}" in command.help, verb

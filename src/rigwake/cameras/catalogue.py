@@ -75,25 +75,35 @@ def camera_to_dict(camera: CameraModel) -> dict[str, Any]:
 
 
 def camera_from_dict(plain: Mapping[str, Any]) -> CameraModel:
-    """The camera that `camera_to_dict` described; CameraError names what is missing or unknown."""
+    """The camera that `camera_to_dict` described, parameters in any order.
+
+    CameraError names what is missing or unknown.
+    """
     missing = {"model", "width_px", "height_px", "params"} - plain.keys()
     if missing:
         raise CameraError(f"A camera lacks {', '.join(sorted(missing))}.")
     if not isinstance(plain["params"], Mapping):
         raise CameraError("A camera's params must map names to values.")
-    names, values = tuple(plain["params"]), list(plain["params"].values())
+    given = plain["params"]
+    names = _param_names(str(plain["model"]), len(given))
+    if given.keys() != set(names):
+        raise CameraError(
+            f"{plain['model']} takes the parameters {', '.join(names)}; the file has {', '.join(map(str, given))}."
+        )
     limit = plain.get("max_angle_deg")
     try:
+        values = [float(given[name]) for name in names]
         max_angle = None if limit is None else float(np.deg2rad(float(limit)))
         size = int(plain["width_px"]), int(plain["height_px"])
-        camera = camera_from_params(str(plain["model"]), values, *size, max_angle)
     except (TypeError, ValueError) as error:
         raise CameraError(
             f"A camera of model {plain['model']!r} has a value that is not a number."
         ) from error
-    if camera.param_names != names:
-        raise CameraError(
-            f"{camera.model} takes the parameters {', '.join(camera.param_names)}, in this order; "
-            f"the file has {', '.join(map(str, names))}."
-        )
-    return camera
+    return camera_from_params(str(plain["model"]), values, *size, max_angle)
+
+
+def _param_names(model: str, count: int) -> tuple[str, ...]:
+    """Names of a model's parameters, in order. Only the length of Scaramuzza's polynomial depends on the count."""
+    lens = camera_class(model)
+    nominal = lens.nominal_values(1.0, 0.0, 0.0)
+    return lens((*nominal[:count], *[0.0] * (count - len(nominal))), 1, 1).param_names

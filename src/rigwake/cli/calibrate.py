@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 import yaml
-from rich.table import Table
+from rich.markup import escape
 
-from rigwake.cli.console import next_step, out, share_bars, write_json
-from rigwake.cli.topic_options import TopicOption, TopicsOption
+from rigwake.cli.console import figures_table, next_step, out, print_title, share_bars, write_json
+from rigwake.cli.options import JsonOption, TopicOption, TopicsOption
 
 if TYPE_CHECKING:
     from rigwake.calibration import Calibration
+    from rigwake.pipeline.calibrate import CalibrationRun
+
+_OPEN = "undetermined"
 
 
 def command(
@@ -47,9 +50,7 @@ def command(
     print_config: Annotated[bool, typer.Option("--print-config", help="Show all settings and stop.")] = False,
     topic: TopicOption = (),
     topics: TopicsOption = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the result as JSON ('-': print).")
-    ] = None,
+    json_file: JsonOption = None,
 ) -> None:
     """Find where every camera of a recording sits and looks, and how sure that is.
 
@@ -93,34 +94,49 @@ def command(
     if json_file is not None:
         write_json(json_file, calibration_to_dict(run.calibration))
     if str(json_file) != "-":
-        print_calibration(run.calibration)
-        for name, reason in run.failed.items():
-            out.print(f"[red]{name} is not calibrated:[/red] {reason}")
-        for note in run.notes:
-            out.print(f"[dim]note: {note}[/dim]")
-        out.print(f"written: {run.out / 'calibration.yaml'}, {run.out / 'report.html'}", soft_wrap=True)
-        next_step(f"rigwake report {run.out} --open", "look at it before you believe it")
+        _print_run(run)
+
+
+def _print_run(run: CalibrationRun) -> None:
+    """The rig, what was given up and noted, what was written, what to do next."""
+    print_calibration(run.calibration)
+    for name, reason in run.failed.items():
+        out.print(f"[red]{escape(name)} is not calibrated:[/red] {escape(reason)}")
+    for note in run.notes:
+        out.print(f"[dim]note: {escape(note)}[/dim]")
+    out.print(f"written: {run.out / 'calibration.yaml'}, {run.out / 'report.html'}", soft_wrap=True)
+    next_step(f"rigwake report {run.out} --open", "look at it before you believe it")
+
+
+def _millimetres(value_m: float, std_m: float) -> str:
+    """No digits that the standard deviation does not earn."""
+    digits = 1 if std_m < 0.01 else 0
+    return f"{1e3 * value_m:+.{digits}f} ± {1e3 * std_m:.{digits}f}"
 
 
 def print_calibration(calibration: Calibration) -> None:
     """The rig as a table: position with sigmas, sigma of the rotation, clock, repeatability."""
-    table = Table(title=f"cameras in {calibration.reference} (± one sigma)")
-    for heading in ("camera", "x m", "y m", "z m", "± rotation °", "clock ms", "halves apart (sigmas)"):
-        table.add_column(heading, justify="left" if heading == "camera" else "right")
+    headings = ("camera", "x mm", "y mm", "z mm", "± deg", "clock ms", "halves")
+    table = figures_table(headings)
     halves = calibration.checks.get("split_half", {})
     for name, camera in calibration.cameras.items():
         known = camera.determined_axes
         cells = [
-            f"{x:+.3f} ± {s:.3f}" if ok else "not determined"
+            _millimetres(x, s) if ok else _OPEN
             for x, s, ok in zip(
                 camera.rig_from_cam.translation, camera.std_translation_m, known[3:], strict=True
             )
         ]
-        rotation = f"{camera.std_rotation_deg.max():.3f}" if known[:3].all() else "not determined"
+        rotation = f"{camera.std_rotation_deg.max():.3f}" if known[:3].all() else _OPEN
         clock = "–" if camera.time_offset_s is None else f"{1e3 * camera.time_offset_s:+.2f}"
         apart = halves.get(name, {}).get("sigmas") if isinstance(halves, dict) else None
-        table.add_row(name, *cells, rotation, clock, "–" if apart is None else f"{apart:.1f}")
+        table.add_row(escape(name), *cells, rotation, clock, "–" if apart is None else f"{apart:.1f}")
+    print_title(f"cameras in {calibration.reference}, ± one sigma")
     out.print(table)
+    if halves:
+        out.print("[dim]deg: rotation, worst axis; halves: difference of both halves in sigmas[/dim]")
     for camera in calibration.cameras.values():
         for direction in camera.undetermined:
-            out.print(f"[yellow]not determined:[/yellow] {direction.words}. {direction.remedy}")
+            out.print(
+                f"[yellow]not determined:[/yellow] {escape(direction.words)}. {escape(direction.remedy)}"
+            )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.panel import Panel
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
 from rigwake.atomic import write_text_atomic
 from rigwake.errors import RigwakeError
@@ -36,6 +37,22 @@ def print_error(error: RigwakeError) -> None:
 def next_step(command: str, why: str) -> None:
     """Name the next step, as every command does when it ends."""
     out.print(f"\n[bold]next:[/bold] [cyan]{escape(command)}[/cyan]  {escape(why)}", soft_wrap=True)
+
+
+def print_title(text: str) -> None:
+    """The heading of a table, on a line of its own however narrow the table is."""
+    out.print(escape(text), style="bold", highlight=False, soft_wrap=True)
+
+
+def figures_table(headings: Sequence[str], words: int = 1) -> Table:
+    """A table of figures that stays readable on 80 columns: no rules, no figure wrapped, units in the headings.
+
+    words: how many columns from the left hold words; the rest holds figures, to the right.
+    """
+    table = Table(box=None, pad_edge=False)
+    for index, heading in enumerate(headings):
+        table.add_column(heading, justify="left" if index < words else "right", no_wrap=index >= words)
+    return table
 
 
 def write_json(path: Path, content: Any) -> None:

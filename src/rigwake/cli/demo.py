@@ -17,7 +17,9 @@ def command(
 ) -> None:
     """Simulate a harbour recording, calibrate it, compare with the truth and write the report.
 
-    The recording is kept: a second run calibrates it again. Example: [cyan]rigwake demo -o demo[/cyan]
+    The recording is kept: a second run calibrates it again.
+
+    Example: [cyan]rigwake demo -o demo[/cyan]
     """
     from rigwake.cli import calibrate, evaluate, report, simulate
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from math import isfinite
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
+from rich.markup import escape
 
-from rigwake.cli.console import next_step, out, write_json
+from rigwake.cli.console import figures_table, next_step, out, print_title, write_json
+from rigwake.cli.options import JsonOption
+
+if TYPE_CHECKING:
+    from rigwake.evaluate.calibrations import CameraDifference
 
 
 def command(
@@ -17,9 +23,7 @@ def command(
     range_m: Annotated[
         list[float] | None, typer.Option("--range", help="Ranges in metres at which pixels are compared.")
     ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the differences ('-': print).")
-    ] = None,
+    json_file: JsonOption = None,
 ) -> None:
     """How far two calibrations are apart: has a camera been knocked, do two recordings agree?
 
@@ -33,32 +37,37 @@ def command(
     a, b, notes = in_common_frame(read_calibration(first), read_calibration(second))
     differences = compare_calibrations(a, b, ranges)
     if json_file is not None:
-        content = {
-            name: {
-                "rotation_deg": d.rotation_deg,
-                "translation_mm": d.translation_mm,
-                "sigmas": d.sigmas,
-                "shift_px": {f"{r:g}": {"median": m, "max": x} for r, (m, x) in d.shift_px.items()},
-            }
-            for name, d in differences.items()
-        }
-        write_json(json_file, plain({"cameras": content}))
+        write_json(json_file, plain({"cameras": {name: d.to_json() for name, d in differences.items()}}))
         if str(json_file) == "-":
             return
-    table = Table(title=f"{second.name} against {first.name}")
-    headings = ["camera", "rotation °", "x mm", "y mm", "z mm", "sigmas", *(f"px at {r:g} m" for r in ranges)]
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading == "camera" else "right")
-    for name, d in differences.items():
-        shifts = [
-            f"{d.shift_px[r][0]:.2f} (max {d.shift_px[r][1]:.2f})" if r in d.shift_px else "–" for r in ranges
-        ]
-        sigmas = "–" if d.sigmas is None else f"{d.sigmas:.1f}"
-        table.add_row(
-            name, f"{d.rotation_deg:.4f}", *(f"{x:+.1f}" for x in d.translation_mm), sigmas, *shifts
-        )
-    out.print(table)
+    _print(differences, ranges, f"{second.name} against {first.name}")
     for note in notes:
         out.print(f"note: {note}", style="yellow", markup=False, highlight=False)
-    out.print("sigmas: root mean square difference in units of both covariances; about 1 means they agree.")
     next_step(f"rigwake export {second} --to ros-static-tf -o tf.launch.py", "load one into your system")
+
+
+def _print(differences: dict[str, CameraDifference], ranges_m: Sequence[float], title: str) -> None:
+    """How the cameras moved, then what that does to their pixels."""
+    moved = figures_table(("camera", "rotation °", "x mm", "y mm", "z mm", "sigmas"))
+    at_ranges = [f"at {r:g} m" for r in ranges_m]
+    pixels = figures_table(("camera", *at_ranges))
+    for name, d in differences.items():
+        sigmas = "–" if d.sigmas is None else f"{d.sigmas:.1f}"
+        moved.add_row(
+            escape(name),
+            *(
+                f"{v:{form}}" if isfinite(v) else "–"
+                for v, form in zip(
+                    (d.rotation_deg, *d.translation_mm), (".4f", "+.1f", "+.1f", "+.1f"), strict=True
+                )
+            ),
+            sigmas,
+        )
+        shifts = [d.shift_px.get(r) for r in ranges_m]
+        pixels.add_row(escape(name), *("–" if s is None else f"{s[0]:.2f} / {s[1]:.2f}" for s in shifts))
+    print_title(title)
+    out.print(moved)
+    out.print("[dim]sigmas: the difference in units of both covariances; about 1: they agree[/dim]")
+    if any(d.shift_px for d in differences.values()):
+        print_title("shift of a point, px: median / largest over the image")
+        out.print(pixels)

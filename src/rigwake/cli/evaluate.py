@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
+from rich.markup import escape
 
-from rigwake.cli.console import next_step, out, write_json
-from rigwake.errors import UsageError
+from rigwake.cli.console import figures_table, next_step, out, print_title, write_json
+from rigwake.cli.options import JsonOption, require
+
+if TYPE_CHECKING:
+    from rigwake.evaluate.calibrations import RigErrors
 
 
 def command(
@@ -24,9 +28,7 @@ def command(
             help="`reference`: in the reference frame; `align`: after fitting the whole rig to the truth."
         ),
     ] = "reference",
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the errors to this file ('-': print).")
-    ] = None,
+    json_file: JsonOption = None,
 ) -> None:
     """Errors of a calibration against a known rig: degrees, metres, and how many of its own sigmas.
 
@@ -36,8 +38,7 @@ def command(
     from rigwake.exporters import UNNAMED_FRAMES, read_calibration
     from rigwake.readers.truth import read_true_rig, rig_in_frame
 
-    if gauge not in ("reference", "align"):
-        raise UsageError(f"--gauge {gauge!r} is unknown.", remedy="Choose reference or align.")
+    require("--gauge", gauge, ("reference", "align"))
     found = read_calibration(calibration)
     rig = read_true_rig(truth)
     if found.reference in UNNAMED_FRAMES:
@@ -51,23 +52,37 @@ def command(
         write_json(json_file, errors.to_json())
         if str(json_file) == "-":
             return
-    table = Table(title=f"errors of {calibration.name}, cameras in {found.reference}")
-    for heading in ("camera", "rotation °", "x m", "y m", "z m", "norm m", "NEES (axes)", "clock ms"):
-        table.add_column(heading, justify="left" if heading == "camera" else "right")
+    _print(errors, f"errors of {calibration.name}, cameras in {found.reference}")
+    next_step(f"rigwake diff {calibration} OTHER.yaml", "compare with another calibration")
+
+
+def _print(errors: RigErrors, title: str) -> None:
+    """Errors per camera, and the worst pair of cameras."""
+    headings = ("camera", "rotation °", "x mm", "y mm", "z mm", "norm mm", "NEES (axes)", "clock ms")
+    table = figures_table(headings)
     for name, e in errors.cameras.items():
         offset = "–" if e.time_offset_error_s is None else f"{1e3 * e.time_offset_error_s:+.2f}"
         nees = "–" if e.nees is None else f"{e.nees:.1f} ({e.nees_dof})"
-        numbers = [f"{x:+.4f}" for x in e.translation_error_m]
         table.add_row(
-            name, f"{e.rotation_error_deg:.4f}", *numbers, f"{e.translation_error_norm_m:.4f}", nees, offset
+            escape(name),
+            _figure(e.rotation_error_deg, ".4f"),
+            *(_figure(1e3 * x, "+.1f") for x in e.translation_error_m),
+            _figure(1e3 * e.translation_error_norm_m, ".1f"),
+            nees,
+            offset,
         )
+    print_title(title)
     out.print(table)
     if errors.pairs:
         worst_turn = max(errors.pairs, key=lambda p: p.rotation_error_deg)
         worst_shift = max(errors.pairs, key=lambda p: p.translation_error_m)
         out.print(
-            f"camera to camera, worst pair: {worst_turn.rotation_error_deg:.4f}° "
-            f"({worst_turn.first}–{worst_turn.second}), {worst_shift.translation_error_m:.4f} m "
-            f"({worst_shift.first}–{worst_shift.second})"
+            f"camera to camera, worst pair: {_figure(worst_turn.rotation_error_deg, '.4f')}° "
+            f"({worst_turn.first}–{worst_turn.second}), {_figure(1e3 * worst_shift.translation_error_m, '.1f')} mm "
+            f"({worst_shift.first}–{worst_shift.second})",
+            markup=False,
         )
-    next_step(f"rigwake diff {calibration} OTHER.yaml", "compare with another calibration")
+
+
+def _figure(value: float, form: str) -> str:
+    return f"{value:{form}}" if isfinite(value) else "–"

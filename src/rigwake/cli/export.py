@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rigwake.cli.console import next_step, out
-from rigwake.errors import UsageError
+from rigwake.cli.options import require
 
 
 def command(
@@ -46,8 +46,7 @@ def command(
     from rigwake.exporters import FORMATS, ExportOptions, export_calibration, read_calibration
     from rigwake.exporters.basalt import read_imu_noise
 
-    if to not in FORMATS:
-        raise UsageError(f"There is no format {to!r}.", remedy=f"Known: {', '.join(FORMATS)}.")
+    require("--to", to, list(FORMATS))
     target = output or calibration.parent / "exports" / FORMATS[to].usual_file
     options = ExportOptions(
         parent_frame, child_frame, None if imu is None else read_imu_noise(imu), max_fit_error

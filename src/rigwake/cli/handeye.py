@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
-from rigwake.cli.console import err, next_step, out, write_json
-from rigwake.errors import UsageError
+from rigwake.cli.console import err, figures_table, next_step, out, print_title, write_json
+from rigwake.cli.options import JsonOption, require
 
 if TYPE_CHECKING:
     from rigwake.calibration import CalibratedCamera
@@ -25,9 +24,7 @@ def command(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write calibration.yaml here.")
     ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the result to this file ('-': print).")
-    ] = None,
+    json_file: JsonOption = None,
     method: Annotated[
         str, typer.Option(help="`ml`: maximum likelihood; `seed`: the linear baseline.")
     ] = "ml",
@@ -54,12 +51,8 @@ def command(
     from rigwake.handeye.calibrate import calibrate_handeye
     from rigwake.handeye.values import HandeyeOptions
 
-    if method not in ("ml", "seed"):
-        raise UsageError(f"--method {method!r} is unknown.", remedy="Choose ml or seed.")
-    if noise not in ("auto", "estimated", "increments", "poses"):
-        raise UsageError(
-            f"--noise {noise!r} is unknown.", remedy="Choose auto, estimated, increments or poses."
-        )
+    require("--method", method, ("ml", "seed"))
+    require("--noise", noise, ("auto", "estimated", "increments", "poses"))
     inputs = [_Input.parse(text) for text in (reference, *others)]
     trajectories = [_read(one) for one in inputs]
     options = HandeyeOptions(
@@ -174,31 +167,45 @@ def _plain(values: Any) -> list[float | None]:
 
 
 def _print(result: HandeyeResult) -> None:
-    import numpy as np
-
-    table = Table(title=f"mountings in {result.reference} (rotation vector and offset, ± standard deviation)")
-    for heading in ("member", "axis", "rotation °", "offset m", "clock s", "scale"):
-        table.add_column(heading, justify="left" if heading in ("member", "axis") else "right")
+    """Rotation vectors and offsets, then clocks and scales where they were estimated, then what stays open."""
+    mountings = figures_table(
+        ("member", "axis", "rotation °", "offset mm"),
+        words=2,
+    )
+    others = figures_table(("member", "clock ms", "scale"))
     for name, camera in result.members.items():
-        from rigwake.geometry import so3
-
-        known = bool(np.isfinite(camera.rig_from_cam.rotation).all())
-        turn = np.rad2deg(so3.log(camera.rig_from_cam.rotation)) if known else np.full(3, np.nan)
+        turn = _rotation_vector_deg(camera)
+        offset, offset_std = 1e3 * camera.rig_from_cam.translation, 1e3 * camera.std_translation_m
         for i, axis in enumerate("xyz"):
-            first = i == 0
-            table.add_row(
-                name if first else "",
+            mountings.add_row(
+                escape(name) if i == 0 else "",
                 axis,
-                _figure(turn[i], camera.std_rotation_deg[i], 3),
-                _figure(camera.rig_from_cam.translation[i], camera.std_translation_m[i], 4),
-                _figure(camera.time_offset_s, camera.time_offset_std_s, 5) if first else "",
-                _figure(camera.scale, camera.scale_std, 4) if first else "",
+                _figure(turn[i], camera.std_rotation_deg[i], 4),
+                _figure(offset[i], offset_std[i], 1),
             )
-    out.print(table)
+        clock = None if camera.time_offset_s is None else 1e3 * camera.time_offset_s
+        clock_std = None if camera.time_offset_std_s is None else 1e3 * camera.time_offset_std_s
+        figures = _figure(clock, clock_std, 3), _figure(camera.scale, camera.scale_std, 4)
+        if figures != ("–", "–"):
+            others.add_row(escape(name), *figures)
+    print_title(f"mountings in {result.reference}: rotation vector and offset, ± one sigma")
+    out.print(mountings)
+    if others.row_count:
+        out.print(others)
     out.print(f"noise: {result.noise}; {result.steps} steps, {result.down_weighted} down-weighted")
     for camera in result.members.values():
         for d in camera.undetermined:
             out.print(f"[yellow]not determined: {escape(d.words)}.[/yellow] {escape(d.remedy)}")
+
+
+def _rotation_vector_deg(camera: CalibratedCamera) -> Any:
+    """(3,) degrees; NaN where the rotation is not determined."""
+    import numpy as np
+
+    from rigwake.geometry import so3
+
+    rotation = camera.rig_from_cam.rotation
+    return np.rad2deg(so3.log(rotation)) if np.isfinite(rotation).all() else np.full(3, np.nan)
 
 
 def _figure(value: float | None, std: float | None, digits: int) -> str:

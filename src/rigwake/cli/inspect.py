@@ -10,8 +10,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from rigwake.atomic import write_text_atomic
-from rigwake.cli.console import next_step, out, progress_bar, write_json
-from rigwake.cli.topic_options import TopicOption, TopicsOption
+from rigwake.cli.console import figures_table, next_step, out, progress_bar, write_json
+from rigwake.cli.options import JsonOption, TopicOption, TopicsOption
 from rigwake.inspection.clocks import ClockOffset
 from rigwake.inspection.inspect import Inspection, inspect_recording
 from rigwake.inspection.page import inspection_page
@@ -31,12 +31,15 @@ def command(
     ],
     topic: TopicOption = (),
     topics: TopicsOption = None,
-    json: Annotated[
-        Path | None, typer.Option(help="Write everything measured as JSON ('-' prints it).")
-    ] = None,
+    json_file: JsonOption = None,
     html: Annotated[Path | None, typer.Option(help="Write one HTML page with plots.")] = None,
 ) -> None:
-    """Sensors, rates, gaps, clocks and motion of a recording: is it enough to calibrate?"""
+    """Sensors, rates, gaps, clocks and motion of a recording: is it enough to calibrate?
+
+    Example: [cyan]rigwake inspect sail.bag[/cyan]
+
+    Example: [cyan]rigwake inspect images/ --topic imu=imu.csv --html inspection.html[/cyan]
+    """
     opened = open_recording(recording, TopicMap.from_options(topic, topics))
     with progress_bar() as bar:
         task = bar.add_task("reading", total=1)
@@ -44,11 +47,11 @@ def command(
             opened, lambda text, done, total: bar.update(task, description=text, completed=done, total=total)
         )
     verdict = judge(inspection)
-    if json is not None:
-        write_json(json, inspection_to_dict(inspection, verdict))
+    if json_file is not None:
+        write_json(json_file, inspection_to_dict(inspection, verdict))
     if html is not None:
         write_text_atomic(html, inspection_page(inspection, verdict))
-    if str(json) != "-":
+    if str(json_file) != "-":
         _print(inspection, verdict)
         if verdict.word == "not enough":
             next_step("rigwake inspect NEW_RECORDING", "after recording again as advised")
@@ -80,9 +83,7 @@ def _print(inspection: Inspection, verdict: Verdict) -> None:
 
 def _sensor_table(inspection: Inspection) -> Table:
     heads = ("sensor", "samples", "s", "Hz", "jitter ms", "missing", "clock to IMU")
-    table = Table(*heads, box=None, pad_edge=False)
-    for column in table.columns:
-        column.no_wrap = True
+    table = figures_table(heads)
     for key, t in inspection.timings.items():
         table.add_row(
             escape(key),

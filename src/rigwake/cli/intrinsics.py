@@ -9,7 +9,8 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from rigwake.cli.console import next_step, out, progress_bar, write_json
+from rigwake.cli.console import figures_table, next_step, out, print_title, progress_bar, write_json
+from rigwake.cli.options import JsonOption
 from rigwake.errors import UsageError
 
 if TYPE_CHECKING:
@@ -43,9 +44,7 @@ def command(
     fix: Annotated[str, typer.Option(help="Parameters to hold, comma-separated: `skew,k3`.")] = "",
     free: Annotated[str, typer.Option(help="Parameters to estimate though they are held by default.")] = "",
     plots: Annotated[Path | None, typer.Option(help="Folder for the coverage and residual plots.")] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the result to this file ('-': print).")
-    ] = None,
+    json_file: JsonOption = None,
 ) -> None:
     """A camera's lens from images of a board, for pinholes and for fisheyes beyond 180 degrees.
 
@@ -125,8 +124,8 @@ def _compare(observations: BoardObservations) -> list[ModelScore]:
 
 def _print(result: IntrinsicCalibration, observations: BoardObservations, scores: list[ModelScore]) -> None:
     if scores:
-        table = Table(title="cross-validation: held-out views")
-        for heading in ("model", "RMS px", "± px", "free parameters", ""):
+        table = Table(box=None, pad_edge=False)
+        for heading in ("model", "RMS px", "± px", "free", ""):
             table.add_column(heading, justify="left" if heading in ("model", "") else "right")
         for score in sorted(scores, key=lambda s: s.held_out_px):
             chosen = "chosen" if score.model == result.camera.model else score.failure
@@ -134,15 +133,16 @@ def _print(result: IntrinsicCalibration, observations: BoardObservations, scores
                 ("–", "–") if score.failure else (f"{score.held_out_px:.4f}", f"{score.std_error_px:.4f}")
             )
             table.add_row(score.model, *figures, str(score.free_count), chosen)
+        print_title("cross-validation: held-out views")
         out.print(table)
-    table = Table(title=f"{result.camera.model}, {result.camera.width_px} x {result.camera.height_px} px")
-    for heading in ("parameter", "value", "± 1 sigma"):
-        table.add_column(heading, justify="left" if heading == "parameter" else "right")
+    size = f"{result.camera.width_px} x {result.camera.height_px} px"
+    table = figures_table(("parameter", "value", "± 1 sigma"))
     for (parameter, std), value in zip(result.stds.items(), result.camera.params.tolist(), strict=True):
         doubt = (
             "held" if parameter in result.fixed else f"{std:.3g}" if np.isfinite(std) else "not determined"
         )
         table.add_row(parameter, f"{value:.8g}" if np.isfinite(std) else "–", doubt)
+    print_title(f"{result.camera.model}, {size}")
     out.print(table)
     out.print(
         f"{result.corners.used.sum()} corners in {len(result.view_names)} views to "

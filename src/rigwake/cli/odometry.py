@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, cast, get_args
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
-from rigwake.cli.console import next_step, out, progress_bar, write_json
-from rigwake.cli.topic_options import TopicOption, TopicsOption
-from rigwake.errors import RigwakeError, UsageError
+from rigwake.cli.console import figures_table, next_step, out, progress_bar, write_json
+from rigwake.cli.options import JsonOption, TopicOption, TopicsOption, require
+from rigwake.errors import RigwakeError
 
 if TYPE_CHECKING:
     from rigwake.odometry.camera import CameraOdometry, CameraOdometryOptions
@@ -45,9 +44,7 @@ def command(
     seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
     topic: TopicOption = (),
     topics: TopicsOption = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Counts, losses and speed ('-': print).")
-    ] = None,
+    json_file: JsonOption = None,
 ) -> None:
     """Where a camera was, frame by frame: metric with an IMU or GNSS, up to scale without, and says so.
 
@@ -60,8 +57,8 @@ def command(
     from rigwake.readers.topics import TopicMap
     from rigwake.tracking.options import FrontEndName, TrackingOptions
 
-    _require("--front-end", front_end, get_args(FrontEndName))
-    _require("--method", method, get_args(Method))
+    require("--front-end", front_end, get_args(FrontEndName))
+    require("--method", method, get_args(Method))
     opened = open_recording(recording, TopicMap.from_options(topic, topics))
     options = CameraOdometryOptions(
         method=cast(Method, method),
@@ -76,27 +73,25 @@ def command(
     streams = list(opened.cameras.values()) if camera == "all" else [opened.camera(camera)]
     sensors = _first(opened.imus) if imu else None, _first(opened.gnss) if gnss else None
     results = _run_all(streams, *sensors, options)
-    output.mkdir(parents=True, exist_ok=True)
-    for name, result in results.items():
-        if not isinstance(result, RigwakeError):
-            _write(output, name, result)
     if json_file is not None:
         write_json(json_file, _summary(opened, results))
-    failures = [r for r in results.values() if isinstance(r, RigwakeError)]
-    if str(json_file) != "-":
+    _keep(results, output, quiet=str(json_file) == "-")
+
+
+def _keep(results: dict[str, CameraOdometry | RigwakeError], output: Path, quiet: bool) -> None:
+    """Write and print what succeeded; raises the first failure if nothing did."""
+    output.mkdir(parents=True, exist_ok=True)
+    done = {n: r for n, r in results.items() if not isinstance(r, RigwakeError)}
+    for name, result in done.items():
+        _write(output, name, result)
+    if not quiet:
         _print(results)
-    if len(failures) == len(results):
-        raise failures[0]
-    if str(json_file) != "-":
-        files = " ".join(
-            str(output / f"{n}.tum") for n, r in results.items() if not isinstance(r, RigwakeError)
-        )
+    for failure in results.values():
+        if not done and isinstance(failure, RigwakeError):
+            raise failure
+    if not quiet:
+        files = " ".join(str(output / f"{name}.tum") for name in done)
         next_step(f"rigwake handeye {files}", "a rig from these trajectories")
-
-
-def _require(option: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise UsageError(f"{option} {value!r} is unknown.", remedy=f"Choose from {', '.join(known)}.")
 
 
 def _first(streams: Any) -> Any:
@@ -215,25 +210,23 @@ def _one_summary(result: CameraOdometry | RigwakeError) -> dict[str, Any]:
 
 
 def _print(results: dict[str, CameraOdometry | RigwakeError]) -> None:
-    table = Table(
-        "camera", "frames placed", "segments", "lost", "bridged", "path", "scale", "frames/s", box=None
-    )
+    headings = ("camera", "metres from", "placed", "segments", "lost", "bridged", "path", "frames/s")
+    table = figures_table(headings, words=2)
     for name, result in results.items():
         if isinstance(result, RigwakeError):
-            table.add_row(escape(name), "[red]failed[/red]", "", "", "", "", "", "")
+            table.add_row(escape(name), "[red]failed[/red]")
             continue
         summary = _one_summary(result)
         visual, smoother = summary.get("visual", {}), summary.get("smoother", {})
         unit = "m" if result.trajectory.is_metric else "units"
-        scale = result.scale_source if result.trajectory.is_metric else "unknown: up to scale"
         table.add_row(
             escape(name),
-            f"{summary['poses']} of {summary['frames']}",
+            result.scale_source if result.trajectory.is_metric else "up to scale",
+            f"{summary['poses']}/{summary['frames']}",
             str(visual.get("segments", "-")),
             str(visual.get("lost", "-")),
             str(smoother.get("frames_bridged", "-")),
             f"{summary['path_length']:.1f} {unit}",
-            scale,
             f"{summary['frames_per_second'] or 0:.0f}",
         )
     out.print(table)

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from rigwake.cli.console import next_step, out
-from rigwake.errors import UsageError
+from rigwake.cli.options import require
 
 
 def command(
@@ -32,8 +32,7 @@ def command(
     """
     from rigwake.report import build_report, load_report_content, summary_lines
 
-    if figure_format not in ("png", "svg"):
-        raise UsageError(f"--figure-format {figure_format!r} is unknown.", remedy="Choose png or svg.")
+    require("--figure-format", figure_format, ("png", "svg"))
     content = load_report_content(folder)
     path = build_report(content)
     for line in summary_lines(content.calibration):

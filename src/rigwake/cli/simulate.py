@@ -12,6 +12,7 @@ import yaml
 
 from rigwake.cli.console import next_step, out, progress_bar
 from rigwake.errors import UsageError
+from rigwake.recording import Finding, Recording
 from rigwake.simulate.record import build_world, render_recording, work_folder
 from rigwake.simulate.scenario import Scenario, build_scenario, load_scenario, preset_names
 from rigwake.simulate.setup import prepare
@@ -34,7 +35,12 @@ def command(
     truth_images: Annotated[bool, typer.Option(help="Also label and range images of every frame.")] = False,
     show: Annotated[bool, typer.Option(help="Print the scenario as YAML and stop.")] = False,
 ) -> None:
-    """Simulate a recording of any rig on a boat in a harbour, with its truth in REC_truth/."""
+    """Simulate a recording of any rig on a boat in a harbour, with its truth in REC_truth/.
+
+    Example: [cyan]rigwake simulate demo -o harbour.bag[/cyan]
+
+    Example: [cyan]rigwake simulate ferry --show > mine.yaml; rigwake simulate mine.yaml -o mine.mcap[/cyan]
+    """
     chosen = _changed(load_scenario(scenario), duration, seed)
     if show:
         print(yaml.safe_dump(chosen.model_dump(mode="json", exclude_none=True), sort_keys=False), end="")
@@ -44,8 +50,21 @@ def command(
     if output.exists():
         raise UsageError(f"{output} is already there.", remedy="Remove it, or choose another name.")
     truth_folder = output.parent / f"{output.stem}_truth"
-    simulation = prepare(chosen)
-    work = work_folder(output, chosen)
+    recording, findings = _record(chosen, output, truth_folder, workers, truth_images)
+    frames = sum(len(camera) for camera in recording.cameras.values())
+    out.print(f"{output}: {len(recording.cameras)} cameras, {frames} frames, {chosen.duration_s:g} s.")
+    out.print(f"{truth_folder}: truth.yaml and true trajectories.")
+    for finding in findings:
+        out.print(f"[dim]{finding.sensor}: {finding.message}[/dim]")
+    next_step(f"rigwake inspect {output}", "see what was recorded")
+
+
+def _record(
+    scenario: Scenario, output: Path, truth_folder: Path, workers: int, truth_images: bool
+) -> tuple[Recording, tuple[Finding, ...]]:
+    """Render and write everything, with a progress bar; what was rendered survives an interruption."""
+    simulation = prepare(scenario)
+    work = work_folder(output, scenario)
     with progress_bar() as bar:
         task = bar.add_task("building the scene (compiles the first time)", total=1)
 
@@ -60,12 +79,7 @@ def command(
         if truth_images:
             write_truth_images(simulation, renderer, truth_folder, show_progress)
     shutil.rmtree(work)
-    frames = sum(len(camera) for camera in recording.cameras.values())
-    out.print(f"{output}: {len(recording.cameras)} cameras, {frames} frames, {chosen.duration_s:g} s.")
-    out.print(f"{truth_folder}: truth.yaml and true trajectories.")
-    for finding in findings:
-        out.print(f"[dim]{finding.sensor}: {finding.message}[/dim]")
-    next_step(f"rigwake inspect {output}", "see what was recorded")
+    return recording, findings
 
 
 def _changed(scenario: Scenario, duration: float | None, seed: int | None) -> Scenario:

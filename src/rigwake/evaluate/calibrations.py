@@ -176,6 +176,15 @@ class CameraDifference:
     sigmas: float | None
     shift_px: dict[float, tuple[float, float]]
 
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {
+            "rotation_deg": self.rotation_deg,
+            "translation_mm": self.translation_mm,
+            "sigmas": self.sigmas,
+            "shift_px": {f"{r:g}": {"median": m, "max": x} for r, (m, x) in self.shift_px.items()},
+        }
+
 
 def compare_calibrations(
     a: Calibration, b: Calibration, ranges_m: Sequence[float] = (5.0, 20.0, 100.0)
