@@ -82,6 +82,15 @@ def test_horizon_of_a_level_camera():
     assert not tilted[120, 175:300].any()
 
 
+def test_high_is_fifteen_degrees_above_the_horizon():
+    model = fisheye()
+    high = HorizonMask(model).high(np.array([0.0, -1, 0]))
+    bearings, _ = model.unproject(np.array([[160.0, row] for row in range(240)]))
+    elevation = np.rad2deg(np.arcsin(-bearings[:, 1]))
+    assert high[elevation > 17, 160].all()
+    assert not high[elevation < 13, 160].any()
+
+
 def test_sky_is_smooth_and_reaches_up_but_houses_stay():
     model = fisheye()
     image = np.full((240, 320), 180, np.uint8)

@@ -147,6 +147,18 @@ def test_displacement_gates_and_region_of_interest():
     assert (pixels <= [180, 150]).all()
 
 
+def test_few_points_are_taken_high_above_the_horizon(hard_scene, hard_stream, hard_tracks):
+    up_cam = np.tile([0.0, -1.0, 0.0], (len(hard_stream), 1))
+    tracks = track_camera(hard_stream, TrackingOptions(max_high_share=0.05), up_cam=up_cam)
+    first = np.unique(tracks.track_ids, return_index=True)[1]
+    high = -tracks.bearings_cam[:, 1] > np.sin(np.deg2rad(16.0))
+    freely = -hard_tracks.bearings_cam[:, 1] > np.sin(np.deg2rad(16.0))
+    assert freely[hard_tracks.frame_indices == 0].sum() > 40
+    in_first_frame = tracks.frame_indices[first] == 0
+    assert 0 < high[first][in_first_frame].sum() <= 20
+    assert (~high[first][in_first_frame]).sum() > 80
+
+
 def test_options_that_do_not_exist_are_refused():
     with pytest.raises(UsageError, match="klt, sift, fast-brief, orb"):
         TrackingOptions(front_end="surf")  # type: ignore[arg-type]

@@ -32,8 +32,8 @@ class DescriptorFrontEnd:
         self.ages = np.empty(0, dtype=np.int64)
         self.points = Keypoints(np.empty((0, 2)), np.empty(0), np.empty((0, 1), np.float32))
 
-    def step(self, image: Image, usable: Mask) -> Observed:
-        """Observations in the next image; `usable` (H, W) says where points may be."""
+    def step(self, image: Image, usable: Mask, high: Mask | None = None) -> Observed:
+        """Observations in the next image; `usable` (H, W) says where points may be; `high` makes no difference."""
         now = self.detect(image, usable)
         ids = np.full(len(now.pixels), -1)
         before, after = self._match(self.points, now)

@@ -47,11 +47,14 @@ def detect_corners(
     cell_px: int,
     min_distance_px: int,
     min_strength: float,
+    last: Mask | None = None,
+    wanted_last: int = 0,
 ) -> Array:
     """The strongest corners away from `occupied` points, balanced over a grid: (K <= wanted, 2) whole pixels.
 
     image: (H, W) grey. usable: (H, W), where corners may lie. occupied: (P, 2) points already followed.
     Cells that hold the fewest points are served first; within a cell the strongest corner wins.
+    last: (H, W), where corners are taken only after all others, at most `wanted_last` of them.
     """
     strength = corner_strength(image)
     peaks = (strength >= cv2.dilate(strength, np.ones((3, 3), np.uint8))) & (strength > min_strength)
@@ -67,7 +70,11 @@ def detect_corners(
     order = order[_claim(free, rows[order], columns[order], min_distance_px)]
     rows, columns = rows[order], columns[order]
     candidates = np.stack([columns, rows], axis=1).astype(np.float64)
-    return candidates[balanced(candidates, occupied, image.shape[1], cell_px)[:wanted]]
+    served = balanced(candidates, occupied, image.shape[1], cell_px)
+    if last is not None:
+        waits = last[rows[served], columns[served]]
+        served = np.r_[served[~waits], served[waits][: max(wanted_last, 0)]]
+    return candidates[served[:wanted]]
 
 
 @njit(cache=True, nogil=True)

@@ -62,10 +62,11 @@ def track_camera(
             row = row_of_index[frame.index]
             if last_ns is not None and (frame.timestamp_ns - last_ns) * 1e-9 > options.max_gap_s:
                 front_end.forget()
-            above = usable
+            above, high = usable, None
             if up_cam is not None and horizon is not None and np.isfinite(up_cam[row]).all():
                 above = usable & ~horizon.below(up_cam[row])
-            run.add(row, front_end.step(frame.image, above))
+                high = horizon.high(up_cam[row])
+            run.add(row, front_end.step(frame.image, above, high))
             last_ns = frame.timestamp_ns
         if progress is not None:
             progress(done + 1)
@@ -78,8 +79,8 @@ class FrontEnd(Protocol):
     def forget(self) -> None:
         """Start anew: the next image does not continue the last one."""
 
-    def step(self, image: Image, usable: Mask) -> Observed:
-        """Observations in the next image; `usable` (H, W) says where points may be."""
+    def step(self, image: Image, usable: Mask, high: Mask | None = None) -> Observed:
+        """Observations in the next image; `usable` (H, W) says where points may be, `high` where most is sky."""
 
 
 def _front_end(model: CameraModel, options: TrackingOptions) -> FrontEnd:

@@ -56,6 +56,10 @@ def _joined(first: Any, second: Any) -> Any:
     return first.join(second) if isinstance(first, References) else np.concatenate([first, second])
 
 
+def _count(region: Mask | None, pixels: Array) -> int:
+    return 0 if region is None else int(np.count_nonzero(inside(region, pixels)))
+
+
 class KltFrontEnd:
     """Follows points through consecutive images of one camera."""
 
@@ -74,13 +78,13 @@ class KltFrontEnd:
         """Start anew: the next image does not continue the last one."""
         self.live = self.image = None
 
-    def step(self, image: Image, usable: Mask) -> Observed:
-        """Observations in the next image; `usable` (H, W) says where points may be."""
+    def step(self, image: Image, usable: Mask, high: Mask | None = None) -> Observed:
+        """Observations in the next image; `usable` (H, W) says where points may be, `high` where most is sky."""
         coefficients = spline_coefficients(image)
         live = self._continue(image, coefficients, usable)
         self.steps_since_detection += 1
         if live is None or self._should_detect(len(live.ids)):
-            live = self._detect(image, coefficients, usable, live)
+            live = self._detect(image, coefficients, usable, high, live)
             self.count_detected, self.steps_since_detection = len(live.ids), 0
         self.live, self.image = live, image
         return live.ids, live.pixels, live.std_px
@@ -140,7 +144,9 @@ class KltFrontEnd:
         )
         return now.take(kept)
 
-    def _detect(self, image: Image, coefficients: Coefficients, usable: Mask, live: _Live | None) -> _Live:
+    def _detect(
+        self, image: Image, coefficients: Coefficients, usable: Mask, high: Mask | None, live: _Live | None
+    ) -> _Live:
         """The live points and new corners."""
         options = self.options
         occupied = np.empty((0, 2)) if live is None else live.pixels
@@ -152,6 +158,8 @@ class KltFrontEnd:
             cell_px=options.cell_px,
             min_distance_px=options.min_distance_px,
             min_strength=(self.noise / options.max_std_px) ** 2,
+            last=high,
+            wanted_last=round(options.max_high_share * options.max_features) - _count(high, occupied),
         )
         stencils, valid = stencil_bearings(self.model, corners)
         bearings, on_lens = self.model.unproject(corners)

@@ -29,6 +29,8 @@ class TrackingOptions:
     matcher, max_ratio: how the other front ends match descriptors, and Lowe's ratio: a match must be closer than
         this share of the distance to the second best. memory: frames for which a point that was not matched is
         remembered. min_displacement_px, max_displacement_px: matches that moved less or more are dropped.
+    max_high_share: of `max_features`, how many new points may lie more than 15 degrees above the horizon, where it
+        is known; below it come first. That high is mostly sky.
     region_of_interest: x, y, width, height of the part of the image to use, pixels; None is all.
     max_gap_s: points are not followed across a longer gap between usable frames.
     """
@@ -52,6 +54,7 @@ class TrackingOptions:
     memory: int = 3
     min_displacement_px: float = 0.0
     max_displacement_px: float = 100.0
+    max_high_share: float = 0.2
     region_of_interest: tuple[int, int, int, int] | None = None
     max_gap_s: float = 0.6
 

@@ -14,6 +14,7 @@ from rigwake.recording import Image
 from rigwake.tracking.masks import pixel_grid
 
 _SMOOTH = 6  # grey levels between neighbours, after a little blur
+_HIGH = float(np.sin(np.deg2rad(15.0)))  # quays, houses and trees end below, unless one is beside them
 _NEAR_TOP = 0.05  # of the sine of the elevation
 
 
@@ -36,6 +37,13 @@ class HorizonMask:
         """(H, W), True below the horizon (in steps of 2 px); `up_cam` (3,) is the unit vector against gravity in
         camera axes."""
         return self._full_size(self._height(up_cam) < self._sine)
+
+    def high(self, up_cam: Array) -> Mask:
+        """(H, W), True more than 15 degrees above the horizon, where most of what is seen is sky (in steps of 2 px).
+
+        Clouds have corners but no parallax: they tell nothing of the way, and the wind moves them.
+        """
+        return self._full_size(self._height(up_cam) > _HIGH)
 
     def _height(self, up_cam: Array) -> NDArray[np.float32]:
         """Sine of the elevation of every second pixel."""
