@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from rigwake.adjustment.cross_camera import HandOverOptions
+from rigwake.adjustment.proposals import HandOverOptions
 from rigwake.adjustment.values import AdjustmentOptions
 from rigwake.errors import UsageError
 from rigwake.odometry.options import OdometryOptions

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from rigwake.adjustment.cross_camera import predicted_pixels
 from rigwake.adjustment.gauge import with_gauge
+from rigwake.adjustment.proposals import predicted_pixels
+from rigwake.adjustment.rounds import SETTLED
 from rigwake.adjustment.values import AdjustmentOptions
 from rigwake.adjustment.verdicts import ReferenceFrame, calibrated_cameras
 from rigwake.bundle.covariance import covariance_of
@@ -18,7 +19,6 @@ from rigwake.bundle.problem import (
     Observations,
     RigProblem,
     RigSolution,
-    SolverOptions,
     States,
 )
 from rigwake.bundle.solver import solve
@@ -85,7 +85,7 @@ def split_half(
     for first, last in ((0, middle), (middle, len(problem.states))):
         try:
             part = part_of(problem, first, last, options.min_observations)
-            solution = solve(part, SolverOptions(tolerance=1e-5))
+            solution = solve(part, SETTLED)
             covariance = covariance_of(solution.problem, clustered=True)
             halves.append(calibrated_cameras(solution, covariance, reference, {}, {}))
         except RigwakeError as error:

@@ -9,17 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.adjustment.cross_camera import (
-    HandOverOptions,
-    find_landmarks,
-    predicted_pixels,
-    propose_searches,
-)
+from rigwake.adjustment.cross_camera import find_landmarks
+from rigwake.adjustment.proposals import HandOverOptions, predicted_pixels, propose_searches
 from rigwake.adjustment.rounds import MAD_TO_STD, adjust
 from rigwake.adjustment.values import AdjustedRig, AdjustmentOptions, AssembledProblem
-from rigwake.bundle.problem import Observations, RigSolution
+from rigwake.bundle.problem import Observations, RigProblem, RigSolution
+from rigwake.cameras.base import Mask
 from rigwake.recording import CameraStream
-from rigwake.tracking.masks import CameraMask, mask_from_file
+from rigwake.tracking.masks import beyond_lens, mask_from_file
 
 _FEWEST_TO_WEIGH = 20
 _KEPT_BACK = 7  # the landmarks of every seventh search are only used to check the result
@@ -59,12 +56,13 @@ def adjust_with_hand_over(
     are kept back.
     """
     used, unused = 0, Observations.empty()
+    usable = _usable(masks_folder, adjusted.solution.problem)
     for done in range(search.rounds):
         last = done == search.rounds - 1
         problem = adjusted.solution.problem
         images = _images(problem.observations, [c.name for c in problem.cameras])
         tell(f"looking for landmarks in other cameras, round {done + 1}")
-        searches = propose_searches(adjusted.solution, images, _masks(masks_folder, streams), search)
+        searches = propose_searches(problem, images, usable, search)
         found = find_landmarks(problem, searches, streams, search)
         if last:
             back = found.landmark_indices % _KEPT_BACK == 0
@@ -79,7 +77,7 @@ def adjust_with_hand_over(
             adjusted.track_ids,
         )
         before = adjusted
-        adjusted = adjust(with_found, replace(options, rounds=2 if last else 1))
+        adjusted = adjust(with_found, replace(options, rounds=2 if last else 1), to_be_continued=not last)
         used += len(found)
         unused = _renumbered(kept_back, before, adjusted)
     return adjusted, HandOver(used, unused)
@@ -108,13 +106,16 @@ def _images(observations: Observations, names: list[str]) -> dict[str, NDArray[n
     }
 
 
-def _masks(folder: Path, streams: Mapping[str, CameraStream]) -> dict[str, CameraMask]:
-    """Masks that the camera stage left."""
-    return {
-        name: mask_from_file(folder / f"{name}.png", stream.width_px, stream.height_px)
-        for name, stream in streams.items()
-        if (folder / f"{name}.png").is_file()
-    }
+def _usable(folder: Path, problem: RigProblem) -> dict[str, Mask]:
+    """Per camera, the pixels (H, W) that show something: within the lens, and in the mask that the camera stage
+    left."""
+    usable = {}
+    for camera in problem.cameras:
+        model, file = camera.model, folder / f"{camera.name}.png"
+        usable[camera.name] = ~beyond_lens(model)
+        if file.is_file():
+            usable[camera.name] &= mask_from_file(file, model.width_px, model.height_px).usable
+    return usable
 
 
 def _renumbered(observations: Observations, before: AdjustedRig, after: AdjustedRig) -> Observations:

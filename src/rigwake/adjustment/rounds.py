@@ -14,6 +14,11 @@ from rigwake.errors import EstimationError
 from rigwake.geometry.so3 import Array
 
 MAD_TO_STD = 1.4826
+# Damping holds back just those directions that are known least, and rounds start near their optimum
+SETTLED = SolverOptions(tolerance=1e-6, shared_tolerance=0.1, initial_damping=1e-8)
+NEARLY_SETTLED = replace(
+    SETTLED, shared_tolerance=0.5
+)  # what is dropped next does not depend on the last digits
 _FIRST_GATE = 3.0  # the first round's gate is wider by this factor: the start is still in the residuals
 _MIN_LANDMARKS = 20
 _NEAREST_INVERSE = 1e4  # 1 / units: what is nearer than a tenth of a millimetre is no landmark
@@ -23,8 +28,12 @@ def adjust(
     assembled: AssembledProblem,
     options: AdjustmentOptions,
     progress: Callable[[str], None] | None = None,
+    *,
+    to_be_continued: bool = False,
 ) -> AdjustedRig:
     """The rig at its optimum after `options.rounds` of solving and dropping outliers.
+
+    to_be_continued: whether another adjustment starts from this one, so that it need not be exact.
 
     Between rounds an observation beyond the gate is dropped, landmarks left with too few observations go, and
     each camera's `std_px` is scaled to the spread that its residuals show. Raises EstimationError when too few
@@ -36,8 +45,8 @@ def adjust(
     dropped = np.zeros(len(problem.cameras), dtype=np.int64)
     for done in range(options.rounds + 1):
         last = done == options.rounds
-        # what is dropped next does not depend on the last digits
-        solver = SolverOptions(loss="cauchy" if done == 0 else "huber", tolerance=1e-5 if last else 1e-3)
+        settled = SETTLED if last and not to_be_continued else NEARLY_SETTLED
+        solver = replace(settled, loss="cauchy" if done == 0 else "huber")
         if progress is not None:
             progress(f"adjusting the rig, round {done + 1}: {len(problem.observations)} observations")
         solution = solve(problem, solver)

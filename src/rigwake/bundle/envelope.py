@@ -15,7 +15,10 @@ from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf
 
 from rigwake.bundle.problem import Indices
+from rigwake.bundle.threads import over_ranges, ranges
 from rigwake.geometry.so3 import Array
+
+_LEAST_PRODUCTS = 2e7  # multiplications that are worth a thread
 
 
 class NotPositiveDefiniteError(ArithmeticError):
@@ -97,23 +100,43 @@ def _solve_lower(L: Array, right: Array, transposed: bool = False) -> Array:
 
 def cholesky(shape: Envelope, matrix: Array) -> Factor:
     """Factor of the matrix whose lower envelope is `matrix`; raises NotPositiveDefiniteError."""
-    values, tile, first = matrix.copy(), shape.tile, shape.first
-    for i in range(len(first)):
-        row = shape.rows(values, i)
-        for j in range(first[i], i + 1):
-            left = j * tile - first[i] * tile
-            block = row[:, left : left + tile]
-            from_tile = max(first[i], first[j])
-            if from_tile < j:
-                ours = row[:, (from_tile - first[i]) * tile : left]
-                theirs = shape.rows(values, j)[:, (from_tile - first[j]) * tile : (j - first[j]) * tile]
-                block -= ours @ theirs.T
-            if j < i:
-                corner = shape.rows(values, j)[:, (j - first[j]) * tile :]
-                block[:] = _solve_lower(corner, block.T).T
-            else:
-                lower, info = dpotrf(block.T, lower=0, clean=1)
-                if info != 0 or not np.isfinite(lower).all():
-                    raise NotPositiveDefiniteError(f"pivot {info} of tile {i}")
-                block[:] = lower.T
-    return Factor(shape, values)
+    factor = Factor(shape, matrix.copy())
+    for j in range(len(shape.first)):
+        tiles = j + np.flatnonzero(shape.first[j:] <= j)
+        _subtract_earlier(factor, j, tiles)
+        corner, *below = [_tile(factor, int(i), j) for i in tiles]
+        lower, info = dpotrf(corner.T, lower=0, clean=1)
+        if info != 0 or not np.isfinite(lower).all():
+            raise NotPositiveDefiniteError(f"pivot {info} of tile {j}")
+        corner[:] = lower.T
+        if below:
+            solved = _solve_lower(corner, np.concatenate(below).T).T
+            starts = np.cumsum([len(block) for block in below])[:-1]
+            for block, rows in zip(below, np.split(solved, starts), strict=True):
+                block[:] = rows
+    return factor
+
+
+def _tile(factor: Factor, i: int, j: int) -> Array:
+    """Tile (i, j): a view."""
+    shape = factor.shape
+    left = (j - shape.first[i]) * shape.tile
+    return shape.rows(factor.values, i)[:, left : left + shape.tile]
+
+
+def _subtract_earlier(factor: Factor, j: int, tiles: Indices) -> None:
+    """Subtract from each of the `tiles` of column j what the columns before it account for."""
+    shape, first = factor.shape, factor.shape.first
+    from_tiles = np.maximum(first[tiles], first[j])
+    widths = (j - from_tiles) * shape.tile
+
+    def work(begin: int, end: int) -> None:
+        own = shape.rows(factor.values, j)
+        for k in range(begin, end):
+            if widths[k]:
+                i, skipped, theirs = tiles[k], from_tiles[k] - first[tiles[k]], from_tiles[k] - first[j]
+                row = shape.rows(factor.values, i)[:, skipped * shape.tile :]
+                block = _tile(factor, i, j)
+                block -= row[:, : widths[k]] @ own[:, theirs * shape.tile :][:, : widths[k]].T
+
+    over_ranges(ranges(widths * float(shape.tile**2), _LEAST_PRODUCTS), work)

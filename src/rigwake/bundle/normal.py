@@ -20,6 +20,7 @@ from rigwake.bundle.layout import Layout
 from rigwake.bundle.motion import TimedPoses
 from rigwake.bundle.problem import Indices
 from rigwake.bundle.schur import FrameEquations, FramePairs
+from rigwake.bundle.threads import over_ranges
 from rigwake.geometry.so3 import Array
 
 
@@ -82,26 +83,9 @@ class NormalEquations:
 
     def add_frames(self, equations: FrameEquations, pairs: FramePairs, poses: TimedPoses) -> None:
         """Add reduced frames, whose tangents depend on states and shared parameters as `poses` says."""
-        n, shape = self.layout.n_state_columns, self.shape
-        held = self.layout.held[poses.states * self.layout.state_dim]
-        by_states = np.where(held[..., None, None], 0.0, poses.by_states)
-        # felt[f]: what the shared parameters' steps do to the right-hand side of frame f
-        felt = np.zeros((len(poses.states), 6, self.layout.n_columns - n))
-        _scatter_frame_pairs(
-            equations.blocks,
-            pairs.row_starts,
-            pairs.partners,
-            poses.states * self.layout.state_dim,
-            by_states,
-            poses.shared - n,
-            poses.by_shared,
-            felt,
-            n,
-            self.states,
-            shape.tile,
-            shape.first,
-            shape.offsets,
-        )
+        n = self.layout.n_state_columns
+        self._add_states(equations.blocks, pairs, poses)
+        felt = self._felt(equations.blocks, pairs, poses)
         felt[:, :, self.layout.extras_start - n :] += equations.with_extras
         jacobian, columns = poses.chain(self.layout)
         coupling = np.einsum("fia,fik->fak", jacobian, felt)
@@ -112,6 +96,36 @@ class NormalEquations:
         diagonals = np.einsum("fia,fi,fia->fa", jacobian, equations.diagonal, jacobian)
         self._add_vectors(gradients, diagonals, columns)
         self._add_extras(equations)
+
+    def _add_states(self, blocks: Array, pairs: FramePairs, poses: TimedPoses) -> None:
+        """Add `J_f^T S J_g` of every pair of frames and its transpose to the states."""
+        first_columns, shape = poses.states * self.layout.state_dim, self.shape
+        held = self.layout.held[first_columns][..., None, None]
+        width = poses.by_states.shape[3]
+        # whole vectors of the processor: the padding is multiplied, but not added
+        by_states = np.pad(np.where(held, 0.0, poses.by_states), ((0, 0), (0, 0), (0, 0), (0, -width % 4)))
+
+        def work(first: int, last: int) -> None:
+            _scatter_states(
+                first, last, blocks, pairs.row_starts, pairs.partners, first_columns, by_states, width,
+                self.layout.n_state_columns, self.states, shape.tile, shape.first, shape.offsets,
+            )  # fmt: skip
+
+        over_ranges(_apart(pairs.bounds, poses.states), work)
+
+    def _felt(self, blocks: Array, pairs: FramePairs, poses: TimedPoses) -> Array:
+        """(F, 6, k) what the shared parameters' steps do to the right-hand side of every frame."""
+        n = self.layout.n_state_columns
+        felt = np.zeros((len(poses.states), self.layout.n_columns - n, 6))
+
+        def work(first: int, last: int) -> None:
+            _scatter_shared(
+                first, last, blocks, pairs.row_starts, pairs.partners, pairs.rows, pairs.column_starts,
+                pairs.columns, poses.shared - n, poses.by_shared, felt,
+            )  # fmt: skip
+
+        over_ranges(pairs.bounds, work)
+        return np.swapaxes(felt, 1, 2)
 
     def _add_extras(self, equations: FrameEquations) -> None:
         start = self.layout.extras_start
@@ -188,7 +202,16 @@ def _scatter_blocks(blocks, columns, states, border, corner, tile, first, offset
                     corner[i - n, j - n] += blocks[m, a, b]
 
 
-@njit(cache=True)
+def _apart(bounds: Indices, states: Indices) -> Indices:
+    """Those bounds between ranges of frames (or the next ones) that leave no two ranges a state (F, s) in common:
+    frames are in time order, but their clocks may differ, and between states two are involved."""
+    latest = np.maximum.accumulate(states.max(axis=1))
+    earliest = np.minimum.accumulate(states.min(axis=1)[::-1])[::-1]
+    clear = np.concatenate([np.flatnonzero(latest[:-1] < earliest[1:]) + 1, [len(states)]])
+    return np.unique(np.concatenate([[0], clear[np.searchsorted(clear, bounds[1:])]]))
+
+
+@njit(cache=True, nogil=True)
 def _position(i, j, n, tile, first, offsets):  # type: ignore[no-untyped-def]
     """Where row i, column j <= i lies in the values of an `Envelope`."""
     t = i // tile
@@ -196,73 +219,75 @@ def _position(i, j, n, tile, first, offsets):  # type: ignore[no-untyped-def]
     return offsets[t] + (i - t * tile) * width + j - first[t] * tile
 
 
-@njit(cache=True)
-def _scatter_frame_pairs(  # type: ignore[no-untyped-def]
-    blocks,
-    row_starts,
-    partners,
-    state_columns,
-    by_states,
-    shared,
-    by_shared,
-    felt,
-    n,
-    states,
-    tile,
-    first,
-    offsets,
+@njit(cache=True, nogil=True)
+def _scatter_states(  # type: ignore[no-untyped-def]
+    begin, end, blocks, row_starts, partners, columns, by_states, w, n, states, tile, first, offsets
 ):
-    """Add `J_f^T S J_g` of every pair (f, g) and its transpose to the states, and `S B_g` to `felt` of f."""
-    neighbours, w, k = by_states.shape[1], by_states.shape[3], shared.shape[1]
-    right, product = np.empty((6, w)), np.empty((w, w))
-    for f in range(len(row_starts) - 1):
-        for pair in range(row_starts[f], row_starts[f + 1]):
-            g, S = partners[pair], blocks[pair]
-            for a in range(k):
-                if shared[g, a] >= 0:
-                    for i in range(6):
-                        for m in range(6):
-                            felt[f, i, shared[g, a]] += S[i, m] * by_shared[g, m, a]
-                if g != f and shared[f, a] >= 0:
-                    for i in range(6):
-                        for m in range(6):
-                            felt[g, i, shared[f, a]] += S[m, i] * by_shared[f, m, a]
+    """Add `J_f^T S J_g` of every pair (f, g) and its transpose; the partners of one state are summed first."""
+    neighbours, padded = by_states.shape[1], by_states.shape[3]
+    right, product = np.empty((neighbours, 6, padded)), np.empty((padded, padded))
+    for f in range(begin, end):
+        pair, stop = row_starts[f], row_starts[f + 1]
+        while pair < stop:
+            of_state = columns[partners[pair]]
+            right[:] = 0.0
+            while pair < stop and columns[partners[pair], 0] == of_state[0]:
+                g = partners[pair]
+                # a frame with itself comes once, and is added with its transpose
+                share = 0.5 if g == f else 1.0
+                for b in range(neighbours):
+                    _add_product(share, blocks[pair], by_states[g, b], right[b])
+                pair += 1
             for b in range(neighbours):
-                column = state_columns[g, b]
-                _multiply(S, by_states[g, b], right)
                 for a in range(neighbours):
-                    row = state_columns[f, a]
-                    if f == g and row < column:
-                        continue
-                    _multiply_transposed(by_states[f, a], right, product)
-                    for i in range(w):
-                        for j in range(w):
-                            value = product[i, j]
-                            if row == column and f != g:
-                                value += product[j, i]
-                            if row >= column:
-                                states[_position(row + i, column, n, tile, first, offsets) + j] += value
-                            else:
-                                states[_position(column + j, row, n, tile, first, offsets) + i] += value
+                    product[:] = 0.0
+                    _add_product(1.0, by_states[f, a].T, right[b], product)
+                    _add_symmetric(product, columns[f, a], of_state[b], w, n, states, tile, first, offsets)
 
 
-@njit(cache=True)
-def _multiply(a, b, out):  # type: ignore[no-untyped-def]
-    """`a b`, row by row so that the inner loop is contiguous."""
+@njit(cache=True, nogil=True)
+def _add_symmetric(product, row, column, w, n, states, tile, first, offsets):  # type: ignore[no-untyped-def]
+    """Add a block (w, w) that starts at a row and column, and its transpose, to the lower triangle."""
+    for i in range(w):
+        if row >= column:
+            at = _position(row + i, column, n, tile, first, offsets)
+            for j in range(w):
+                states[at + j] += product[i, j]
+        if row <= column:
+            at = _position(column + i, row, n, tile, first, offsets)
+            for j in range(w):
+                states[at + j] += product[j, i]
+
+
+@njit(cache=True, nogil=True)
+def _scatter_shared(  # type: ignore[no-untyped-def]
+    begin, end, blocks, row_starts, partners, rows, column_starts, columns, shared, by_shared, felt
+):
+    """Add `(S B_g)^T` of every pair with g to `felt` of f, whichever of the two is later."""
+    for f in range(begin, end):
+        for pair in range(row_starts[f], row_starts[f + 1]):
+            g = partners[pair]
+            _add_columns(blocks[pair], by_shared[g], shared[g], felt[f])
+        for slot in range(column_starts[f], column_starts[f + 1]):
+            g = rows[columns[slot]]
+            _add_columns(blocks[columns[slot]].T, by_shared[g], shared[g], felt[f])
+
+
+@njit(cache=True, nogil=True)
+def _add_columns(S, B, columns, out):  # type: ignore[no-untyped-def]
+    for a in range(len(columns)):
+        for m in range(6):
+            # most of B is zero: a camera's mounting moves it as it says
+            if columns[a] >= 0 and B[m, a] != 0:
+                for i in range(6):
+                    out[columns[a], i] += S[i, m] * B[m, a]
+
+
+@njit(cache=True, nogil=True)
+def _add_product(factor, a, b, out):  # type: ignore[no-untyped-def]
+    """`out += factor a b`, row by row so that the inner loop is contiguous."""
     for i in range(out.shape[0]):
-        out[i] = 0.0
         for k in range(a.shape[1]):
-            factor = a[i, k]
+            x = factor * a[i, k]
             for j in range(out.shape[1]):
-                out[i, j] += factor * b[k, j]
-
-
-@njit(cache=True)
-def _multiply_transposed(a, b, out):  # type: ignore[no-untyped-def]
-    """`a^T b`."""
-    for i in range(out.shape[0]):
-        out[i] = 0.0
-        for k in range(a.shape[0]):
-            factor = a[k, i]
-            for j in range(out.shape[1]):
-                out[i, j] += factor * b[k, j]
+                out[i, j] += x * b[k, j]

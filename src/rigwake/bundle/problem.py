@@ -317,13 +317,15 @@ class SolverOptions:
 
     loss: robust loss of the observations on their whitened norm, with its width `loss_scale` (sigmas).
     gnss_loss_scale: width of the Huber loss of GNSS fixes (sigmas). tolerance: relative decrease of the cost
-    at which to stop. max_iterations: accepted and rejected steps together.
+    at which to stop. shared_tolerance: or a step of the shared parameters, as a length in units of their own
+    uncertainty, at which to stop (0: never). max_iterations: accepted and rejected steps together.
     """
 
     loss: Loss = "huber"
     loss_scale: float = 2.0
     gnss_loss_scale: float = 3.0
     tolerance: float = 1e-6
+    shared_tolerance: float = 0.0
     max_iterations: int = 50
     initial_damping: float = 1e-4
 

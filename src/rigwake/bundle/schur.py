@@ -16,11 +16,15 @@ import numpy as np
 from numba import njit
 
 from rigwake.bundle.problem import Indices
+from rigwake.bundle.threads import over_ranges, ranges
 from rigwake.geometry.so3 import Array
 
 _LEAST_INFORMATION = (
     1e-10  # added to a landmark's scaled (unit diagonal) block: parallax too small to place it
 )
+
+
+_LEAST_OBSERVATIONS, _LEAST_MEETINGS = 10_000, 50_000  # that are worth a thread
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,19 +48,20 @@ class LinearObservations:
 @dataclass(frozen=True, eq=False)
 class FramePairs:
     """Which frames share landmarks, as rows of a lower triangle: frame f meets
-    `partners[row_starts[f]:row_starts[f + 1]]`, increasing, itself last. Its observations are
-    `observations[observation_starts[f]:observation_starts[f + 1]]`, of the landmarks `landmarks` (M,)."""
+    `partners[row_starts[f]:row_starts[f + 1]]`, increasing, itself last. Later frames meet g in the pairs
+    `columns[column_starts[g]:column_starts[g + 1]]`, of the rows `rows` (P,). Its observations are
+    `observations[observation_starts[f]:observation_starts[f + 1]]`, of the landmarks `landmarks` (M,).
+    bounds: ranges of frames with about equal work (`threads.py`)."""
 
     row_starts: Indices
     partners: Indices
+    rows: Indices
+    column_starts: Indices
+    columns: Indices
     observation_starts: Indices
     observations: Indices
     landmarks: Indices
-
-    @property
-    def rows(self) -> Indices:
-        """(P,) the later frame of each pair."""
-        return np.repeat(np.arange(len(self.row_starts) - 1), np.diff(self.row_starts))
+    bounds: Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +95,16 @@ def frame_pairs(landmark_starts: Indices, frames: Indices, n_frames: int) -> Fra
     row_starts = np.concatenate([[0], np.cumsum(counts)])
     partners = np.empty(row_starts[-1], dtype=np.int64)
     _count_or_list(landmark_starts, frames, starts, sorted_landmarks, row_starts[:-1].copy(), partners)
-    return FramePairs(row_starts, partners, starts, order, sorted_landmarks)
+    rows = np.repeat(np.arange(n_frames), counts)
+    later = np.flatnonzero(partners < rows)
+    columns = later[np.argsort(partners[later], kind="stable")]
+    column_starts = np.searchsorted(partners[columns], np.arange(n_frames + 1))
+    # an observation meets those of the same landmark in this and earlier frames
+    met = np.bincount(frames, np.arange(len(frames)) - landmark_starts[landmark_of] + 1.0, n_frames)
+    bounds = ranges(met + counts, _LEAST_MEETINGS)
+    return FramePairs(
+        row_starts, partners, rows, column_starts, columns, starts, order, sorted_landmarks, bounds
+    )
 
 
 @njit(cache=True)
@@ -137,53 +151,35 @@ def eliminate_landmarks(
     )
     o, e = observations, equations
     coupling, extras_coupling = np.empty((len(o.frames), 3, 6)), np.zeros((n_landmarks, n_extras, 3))
-    own = pairs.row_starts[1:] - 1
-    _sum_up(
-        o.landmark_starts,
-        o.frames,
-        o.residuals,
-        o.by_frame,
-        o.by_landmark,
-        o.by_extras,
-        o.extras,
-        own,
-        damping,
-        coupling,
-        extras_coupling,
-        e.blocks,
-        e.gradient,
-        e.diagonal,
-        e.with_extras,
-        e.extras,
-        e.extras_gradient,
-        e.extras_diagonal,
-        e.landmark_inverse,
-        e.landmark_gradient,
-    )
-    _subtract_landmarks(
-        o.landmark_starts,
-        o.frames,
-        pairs.row_starts,
-        pairs.partners,
-        pairs.observation_starts,
-        pairs.observations,
-        pairs.landmarks,
-        coupling,
-        extras_coupling,
-        e.landmark_inverse,
-        e.landmark_gradient,
-        e.blocks,
-        e.gradient,
-        e.with_extras,
-    )
+
+    def landmarks(first: int, last: int) -> None:
+        _sum_up_landmarks(
+            first, last, o.landmark_starts, o.residuals, o.by_frame, o.by_landmark, o.by_extras, o.extras,
+            damping, coupling, extras_coupling, e.landmark_inverse, e.landmark_gradient,
+        )  # fmt: skip
+
+    def frames(first: int, last: int) -> None:
+        _sum_up_frames(
+            first, last, pairs.row_starts, pairs.observation_starts, pairs.observations, o.residuals,
+            o.by_frame, o.by_extras, o.extras, e.blocks, e.gradient, e.diagonal, e.with_extras,
+        )  # fmt: skip
+        _subtract_landmarks(
+            first, last, o.landmark_starts, o.frames, pairs.row_starts, pairs.partners,
+            pairs.observation_starts, pairs.observations, pairs.landmarks, coupling, extras_coupling,
+            e.landmark_inverse, e.landmark_gradient, e.blocks, e.gradient, e.with_extras,
+        )  # fmt: skip
+
+    over_ranges(ranges(np.diff(o.landmark_starts), _LEAST_OBSERVATIONS), landmarks)
+    over_ranges(pairs.bounds, frames)
     if n_extras:
+        _sum_up_extras(o.residuals, o.by_extras, o.extras, e.extras, e.extras_gradient, e.extras_diagonal)
         by_inverse = extras_coupling @ e.landmark_inverse
         e.extras_gradient[:] -= np.einsum("lqi,li->q", by_inverse, e.landmark_gradient)
         e.extras[:] -= np.tensordot(by_inverse, extras_coupling, axes=([0, 2], [0, 2]))
     return equations
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _invert_damped(V, damping, out):  # type: ignore[no-untyped-def]
     """Inverse of the symmetric 3x3 `V + damping diag(V)`, by its adjugate after scaling to unit diagonal."""
     s = np.empty(3)
@@ -202,87 +198,77 @@ def _invert_damped(V, damping, out):  # type: ignore[no-untyped-def]
             out[i, j] *= s[i] * s[j]
 
 
-@njit(cache=True)
-def _sum_up(  # type: ignore[no-untyped-def]
-    starts,
-    frames,
-    r,
-    Jf,
-    Jl,
-    Je,
-    extras,
-    own,
-    damping,
-    coupling,
-    extras_coupling,
-    blocks,
-    gradient,
-    diagonal,
-    with_extras,
-    corner,
-    extras_gradient,
-    extras_diagonal,
-    inverses,
-    landmark_gradient,
+@njit(cache=True, nogil=True)
+def _sum_up_landmarks(  # type: ignore[no-untyped-def]
+    first, last, starts, r, Jf, Jl, Je, extras, damping, coupling, extras_coupling, inverses, gradient
 ):
-    """`J^T J` and `-J^T r` of all observations, and the landmarks' inverse blocks."""
+    """Landmarks' inverse blocks, gradients, and how their observations couple them with frames and extras."""
     width, V = extras.shape[1], np.empty((3, 3))
-    for landmark in range(len(starts) - 1):
-        g, We = landmark_gradient[landmark], extras_coupling[landmark]
+    for landmark in range(first, last):
+        g, We = gradient[landmark], extras_coupling[landmark]
         V[:] = 0.0
         for m in range(starts[landmark], starts[landmark + 1]):
-            f = frames[m]
-            block = blocks[own[f]]
             for i in range(3):
                 g[i] -= Jl[m, 0, i] * r[m, 0] + Jl[m, 1, i] * r[m, 1]
                 for j in range(3):
                     V[i, j] += Jl[m, 0, i] * Jl[m, 0, j] + Jl[m, 1, i] * Jl[m, 1, j]
+                for j in range(6):
+                    coupling[m, i, j] = Jl[m, 0, i] * Jf[m, 0, j] + Jl[m, 1, i] * Jf[m, 1, j]
+            for a in range(width):
+                q = extras[m, a]
+                if q >= 0:
+                    for i in range(3):
+                        We[q, i] += Je[m, 0, a] * Jl[m, 0, i] + Je[m, 1, a] * Jl[m, 1, i]
+        if starts[landmark + 1] > starts[landmark]:
+            _invert_damped(V, damping, inverses[landmark])
+
+
+@njit(cache=True, nogil=True)
+def _sum_up_frames(  # type: ignore[no-untyped-def]
+    first, last, row_starts, observation_starts, observations, r, Jf, Je, extras, blocks, gradient, diagonal,
+    with_extras,
+):  # fmt: skip
+    """`J^T J` and `-J^T r` of the frames' own observations."""
+    width = extras.shape[1]
+    for f in range(first, last):
+        block = blocks[row_starts[f + 1] - 1]
+        for slot in range(observation_starts[f], observation_starts[f + 1]):
+            m = observations[slot]
             for i in range(6):
                 x, y = Jf[m, 0, i], Jf[m, 1, i]
                 gradient[f, i] -= x * r[m, 0] + y * r[m, 1]
                 diagonal[f, i] += x * x + y * y
                 for j in range(6):
                     block[i, j] += x * Jf[m, 0, j] + y * Jf[m, 1, j]
-                for j in range(3):
-                    coupling[m, j, i] = x * Jl[m, 0, j] + y * Jl[m, 1, j]
-            for a in range(width):
-                q = extras[m, a]
-                if q < 0:
-                    continue
-                x, y = Je[m, 0, a], Je[m, 1, a]
-                extras_gradient[q] -= x * r[m, 0] + y * r[m, 1]
-                extras_diagonal[q] += x * x + y * y
-                for i in range(6):
-                    with_extras[f, i, q] += x * Jf[m, 0, i] + y * Jf[m, 1, i]
-                for i in range(3):
-                    We[q, i] += x * Jl[m, 0, i] + y * Jl[m, 1, i]
-                for b in range(width):
-                    if extras[m, b] >= 0:
-                        corner[q, extras[m, b]] += x * Je[m, 0, b] + y * Je[m, 1, b]
-        if starts[landmark + 1] > starts[landmark]:
-            _invert_damped(V, damping, inverses[landmark])
+                for a in range(width):
+                    if extras[m, a] >= 0:
+                        with_extras[f, i, extras[m, a]] += x * Je[m, 0, a] + y * Je[m, 1, a]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
+def _sum_up_extras(r, Je, extras, corner, gradient, diagonal):  # type: ignore[no-untyped-def]
+    """`J^T J` and `-J^T r` of the extras."""
+    for m in range(len(r)):
+        for a in range(extras.shape[1]):
+            q = extras[m, a]
+            if q < 0:
+                continue
+            x, y = Je[m, 0, a], Je[m, 1, a]
+            gradient[q] -= x * r[m, 0] + y * r[m, 1]
+            diagonal[q] += x * x + y * y
+            for b in range(extras.shape[1]):
+                if extras[m, b] >= 0:
+                    corner[q, extras[m, b]] += x * Je[m, 0, b] + y * Je[m, 1, b]
+
+
+@njit(cache=True, nogil=True)
 def _subtract_landmarks(  # type: ignore[no-untyped-def]
-    starts,
-    frames,
-    row_starts,
-    partners,
-    observation_starts,
-    observations,
-    landmarks,
-    coupling,
-    extras_coupling,
-    inverses,
-    landmark_gradient,
-    blocks,
-    gradient,
-    with_extras,
-):
+    first, last, starts, frames, row_starts, partners, observation_starts, observations, landmarks, coupling,
+    extras_coupling, inverses, landmark_gradient, blocks, gradient, with_extras,
+):  # fmt: skip
     """Subtract `W V^-1 W^T`, frame by frame, so that the blocks of a frame's row stay in the cache."""
     WV, n_extras = np.empty((6, 3)), extras_coupling.shape[1]
-    for f in range(len(row_starts) - 1):
+    for f in range(first, last):
         for slot in range(observation_starts[f], observation_starts[f + 1]):
             m, landmark = observations[slot], landmarks[slot]
             inverse, g, We = inverses[landmark], landmark_gradient[landmark], extras_coupling[landmark]

@@ -148,11 +148,13 @@ def _minimise(problem: RigProblem, options: SolverOptions) -> RigSolution:
                 break
             continue
         gain = trial.actual / trial.predicted
-        settled = trial.actual <= options.tolerance * linear.cost and growth == 2.0
+        small = trial.shared_sigmas <= options.shared_tolerance
+        settled = growth == 2.0 and (small or trial.actual <= options.tolerance * linear.cost)
         damping, growth = damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 2.0
         linear = trial.linear
         if settled:
-            reason, converged = "the cost has settled", True
+            reason = "the shared parameters have settled" if small else "the cost has settled"
+            converged = True
             break
     report = SolverReport(
         converged,
@@ -169,11 +171,15 @@ def _minimise(problem: RigProblem, options: SolverOptions) -> RigSolution:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A step's end, with the decrease of the cost that the linear model promised and the one that came."""
+    """A step's end, with the decrease of the cost that the linear model promised and the one that came.
+
+    shared_sigmas: length of the shared parameters' step in units of their own uncertainty; inf without any.
+    """
 
     linear: Linearisation
     predicted: float
     actual: float
+    shared_sigmas: float
 
 
 def _trial(
@@ -183,7 +189,8 @@ def _trial(
     layout = structure.layout
     equations, reduced = equations_of(linear, structure, damping)
     try:
-        step = equations.damped(damping).factorise().step()
+        solved = equations.damped(damping).factorise()
+        step = solved.step()
     except NotPositiveDefiniteError:
         return None
     frame_step = linear.poses.moved_by(layout, step)
@@ -195,7 +202,9 @@ def _trial(
         moved = linearised(retract(problem, layout, step, marks, bases), structure, options)
     if not np.isfinite(moved.cost):
         return None
-    return _Trial(moved, _promised(equations, reduced, step), linear.cost - moved.cost)
+    shared = step[layout.n_state_columns :]
+    sigmas = float(np.sqrt(shared @ solved.shared @ shared)) if len(shared) else np.inf
+    return _Trial(moved, _promised(equations, reduced, step), linear.cost - moved.cost, sigmas)
 
 
 def _promised(equations: NormalEquations, reduced: FrameEquations, step: Array) -> float:

@@ -10,8 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rigwake.adjustment.cross_camera import camera_from_world
 from rigwake.adjustment.hand_over import HandOver
+from rigwake.adjustment.proposals import camera_from_world
 from rigwake.adjustment.start import FirstRig
 from rigwake.adjustment.values import AdjustedRig
 from rigwake.atomic import atomic_path, write_text_atomic

@@ -103,7 +103,7 @@ def _adjust(
     assembled = assemble_problem(measurements, first.start, config.adjustment)
     assembled = replace(assembled, problem=prior.constrained(assembled.problem))
     tell(f"adjusting {len(assembled.problem.observations)} observations", 0.0)
-    adjusted = adjust(assembled, config.adjustment)
+    adjusted = adjust(assembled, config.adjustment, to_be_continued=config.adjustment.cross_camera)
     if not config.adjustment.cross_camera:
         return adjusted, HandOver.nothing()
     return adjust_with_hand_over(
