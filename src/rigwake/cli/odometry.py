@@ -40,6 +40,13 @@ def command(
         bool,
         typer.Option("--loops", help="Recognise places seen before, also where the odometry did not break."),
     ] = False,
+    refine_lens: Annotated[
+        bool,
+        typer.Option(
+            "--refine-lens/--no-refine-lens",
+            help="Vision alone: refine intrinsics that do not fit the images.",
+        ),
+    ] = True,
     mask: Annotated[Path | None, typer.Option(help="Picture, white where the camera may be used.")] = None,
     seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
     topic: TopicOption = (),
@@ -69,6 +76,7 @@ def command(
         horizon=horizon,
         mask_file=mask,
         loops=loops,
+        refine_lens=refine_lens,
     )
     streams = list(opened.cameras.values()) if camera == "all" else [opened.camera(camera)]
     sensors = _first(opened.imus) if imu else None, _first(opened.gnss) if gnss else None

@@ -1,0 +1,146 @@
+"""Distortion and principal point refined from one camera's own motion.
+
+A lens that is described half a pixel wrong looks well in every image and still ruins monocular scale: in a turn the
+scale is handed on by points that cross the whole image, and a systematic error of their bearings is the same in
+every frame. KITTI's rectified images are a known case (Cvisic, Markovic and Petrovic, *Recalibrating the KITTI
+Dataset Camera Setup for Improved Odometry Accuracy*, 2021).
+
+The focal length is held: how far a camera turns tells it only where it turns full circle; over less it trades
+against distortion and takes the rotations along.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigwake.bundle.problem import (
+    BundleCamera,
+    DistanceMeasurement,
+    Landmarks,
+    Observations,
+    RigProblem,
+    SolverOptions,
+    States,
+    VectorPrior,
+)
+from rigwake.bundle.solver import solve
+from rigwake.cameras.base import CameraModel
+from rigwake.errors import RigwakeError
+from rigwake.geometry.se3 import SE3
+from rigwake.odometry.result import OdometryResult
+from rigwake.tracks import Tracks
+
+Indices = NDArray[np.int64]
+_FOCAL = frozenset({"fx", "fy", "f", "a0"})
+_PRIOR_PX = 1.0  # each parameter alone is believed to be so right, over the pixels that were observed
+_MAX_FRAMES = 150
+_MIN_GAIN = 0.03  # of the cost, under which the lens is right as given
+_MIN_VIEWS = 3
+_HELD_STD = 1e-9
+_SOLVER = SolverOptions(loss="cauchy", loss_scale=2.0, tolerance=1e-5, max_iterations=20)
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedLens:
+    """A lens that explains the tracks better than the one given.
+
+    tracks: the given ones, with bearings by this lens. shift_px: root mean square by which it moves what was
+    observed. gain: share of the adjustment's cost that it took away.
+    """
+
+    camera: CameraModel
+    tracks: Tracks
+    shift_px: float
+    gain: float
+
+
+def refine_lens(tracks: Tracks, camera: CameraModel, visual: OdometryResult) -> RefinedLens | None:
+    """Distortion and principal point estimated with motion and points of the longest segment.
+
+    None where that explains the tracks hardly better than the lens as given, or where it cannot be estimated.
+    Every free parameter has a prior: alone, it moves the observed pixels by one (root mean square).
+    """
+    problem = _problem(tracks, camera, visual)
+    if problem is None:
+        return None
+    try:
+        held = solve(problem, _SOLVER).report.final_cost
+        solution = solve(_with_free_lens(problem), _SOLVER)
+        refined = solution.problem.cameras[0].model
+        bearings, seen = refined.unproject(tracks.pixels)
+    except RigwakeError:  # a lens beyond its bounds, or too little to adjust: the one given stays
+        return None
+    gain = 1.0 - solution.report.final_cost / held
+    if gain < _MIN_GAIN or not seen.all():
+        return None
+    moved, valid = camera.project(bearings)
+    shift = np.linalg.norm(moved[valid] - tracks.pixels[valid], axis=1)
+    return RefinedLens(
+        refined, replace(tracks, bearings_cam=bearings), float(np.sqrt(np.mean(shift**2))), float(gain)
+    )
+
+
+def _problem(tracks: Tracks, camera: CameraModel, visual: OdometryResult) -> RigProblem | None:
+    """Evenly spread frames of the longest segment, what they see, and the lens held."""
+    path = visual.trajectory
+    assert path.segment_ids is not None
+    longest = int(np.argmax(np.bincount(path.segment_ids)))
+    members = np.flatnonzero(path.segment_ids == longest)
+    members = members[:: -(-len(members) // _MAX_FRAMES)]
+    frames = visual.frame_indices[members]
+    ids = visual.landmarks.track_ids[visual.landmarks.segment_ids == longest]
+    points = visual.landmarks.points_world[visual.landmarks.segment_ids == longest]
+    rows = np.flatnonzero(
+        visual.inliers & np.isin(tracks.frame_indices, frames) & np.isin(tracks.track_ids, ids)
+    )
+    owner = np.searchsorted(ids, tracks.track_ids[rows])
+    enough = np.bincount(owner, minlength=len(ids))[owner] >= _MIN_VIEWS
+    rows, owner = rows[enough], owner[enough]
+    if len(members) < _MIN_VIEWS or not len(rows):
+        return None
+    used, first, landmark = np.unique(owner, return_index=True, return_inverse=True)
+    poses = path.world_from_body[members]
+    at = np.searchsorted(frames, tracks.frame_indices[rows])
+    span = np.linalg.norm(poses.translation - poses.translation[0], axis=1)
+    farthest = int(np.argmax(span))
+    if not span[farthest] > 0:
+        return None
+    fixed = np.zeros(len(members), dtype=bool)
+    fixed[0] = True
+    stamps = tracks.timestamps_ns[frames]
+    return RigProblem(
+        States(stamps, poses, fixed=fixed),
+        (BundleCamera(tracks.camera, camera, SE3.identity()),),
+        Landmarks.from_points(points[used], poses.translation[at[first]]),
+        Observations(
+            np.zeros(len(rows), dtype=np.int64),
+            stamps[at],
+            landmark,
+            tracks.pixels[rows],
+            tracks.std_px[rows],
+        ),
+        distances=(DistanceMeasurement(0, farthest, float(span[farthest]), 1e-4 * float(span[farthest])),),
+    )
+
+
+def _with_free_lens(problem: RigProblem) -> RigProblem:
+    """The same with distortion and principal point free, each as sure as one pixel."""
+    camera = problem.cameras[0]
+    lens = camera.model
+    bearings, seen = lens.unproject(problem.observations.pixels)
+    effect = lens.project_with_jacobians(bearings[seen]).d_params
+    px_per_unit = np.sqrt(np.mean(np.sum(effect**2, axis=1), axis=0))
+    held = _FOCAL | set(getattr(lens, "fixed_by_default", ()))
+    std = np.array(
+        [
+            _PRIOR_PX / px if name not in held and px > 0 else _HELD_STD
+            for name, px in zip(lens.param_names, px_per_unit, strict=True)
+        ]
+    )
+    prior = VectorPrior.from_std(lens.params, std)
+    return replace(
+        problem, cameras=(replace(camera, free=frozenset({"intrinsics"}), intrinsics_prior=prior),)
+    )
