@@ -67,6 +67,16 @@ def jittered(poses: SE3, rotation_std: float, translation_std: float, rng: np.ra
     return poses.retract(_errors(len(poses), rotation_std, translation_std, rng))
 
 
+def lasting(
+    poses: SE3, rotation_std: float, translation_std: float, memory: float, rng: np.random.Generator
+) -> SE3:
+    """Errors of the poses that each keep the share `memory` of the one before."""
+    errors = _errors(len(poses), rotation_std, translation_std, rng)
+    for k in range(1, len(errors)):
+        errors[k] = memory * errors[k - 1] + np.sqrt(1 - memory**2) * errors[k]
+    return poses.retract(errors)
+
+
 def _errors(count: int, rotation_std: float, translation_std: float, rng: np.random.Generator) -> np.ndarray:
     return rng.normal(size=(count, 6)) * np.repeat([rotation_std, translation_std], 3)
 

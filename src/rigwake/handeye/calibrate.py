@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -14,16 +13,15 @@ from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
 from rigwake.handeye.information import USEFUL_CLOCK, USEFUL_LOG_SCALE
 from rigwake.handeye.initial import initial_mountings
-from rigwake.handeye.likelihood import Estimate, information_criterion, maximise
+from rigwake.handeye.likelihood import Estimate, maximise
 from rigwake.handeye.motions import Mounting
 from rigwake.handeye.observability import covariance, open_directions
 from rigwake.handeye.problem import HandeyeProblem, pose_problem
 from rigwake.handeye.seed import seed_handeye
+from rigwake.handeye.selection import without_drift
 from rigwake.handeye.values import HandeyeOptions, HandeyeResult
 from rigwake.sync import MIN_OVERLAP, estimate_time_offset
 from rigwake.trajectory import Trajectory
-
-_LONGEST_WITHOUT_DRIFT = 20_000  # steps
 
 
 def calibrate_handeye(
@@ -44,14 +42,8 @@ def calibrate_handeye(
     if options.method == "seed":
         return _seed_result(problem, start)
     estimate = maximise(problem, start, options)
-    if problem.noise == "estimated" and _may_be_poses(estimate):
-        has_clock = [offset is not None for offset in offsets]
-        as_poses = pose_problem(reference, members, replace(options, noise="poses"), has_clock)
-        other = maximise(as_poses, initial_mountings(as_poses, _offsets(estimate)), options)
-        if other.converged and information_criterion(as_poses, other) < information_criterion(
-            problem, estimate
-        ):
-            problem, estimate = as_poses, other
+    if problem.noise == "estimated":
+        problem, estimate = without_drift(problem, estimate, reference, members, options)
     if not estimate.converged:
         raise EstimationError(
             f"Hand-eye calibration did not settle within {options.max_iterations} steps.",
@@ -59,16 +51,6 @@ def calibrate_handeye(
             remedy="Look at the trajectories: do they show one rigid body? Try --noise poses or increments.",
         )
     return _result(problem, estimate, options)
-
-
-def _may_be_poses(estimate: Estimate) -> bool:
-    """The poses jitter, and the recording is not so long that a drift unseen in it would matter."""
-    jitters = any(jitter.rotation and jitter.translation for jitter in estimate.filters)
-    return jitters and len(estimate.valid) <= _LONGEST_WITHOUT_DRIFT
-
-
-def _offsets(estimate: Estimate) -> list[float]:
-    return [mounting.time_offset_s for mounting in estimate.mountings]
 
 
 def _clock(reference: Trajectory, member: Trajectory) -> float | None:

@@ -102,11 +102,12 @@ def _inverse_times(Ra: Array, ta: Array, Rb: Array, tb: Array, R: Array, t: Arra
 
 
 @njit(cache=True)
-def motions(R: Array, t: Array) -> tuple[Array, Array]:
-    """Motions `V_k^-1 V_k+1` of N poses, as (N - 1) rotations and translations."""
-    rotations, translations = np.empty((len(t) - 1, 3, 3)), np.empty((len(t) - 1, 3))
-    for k in range(len(t) - 1):
-        _inverse_times(R[k], t[k], R[k + 1], t[k + 1], rotations[k], translations[k])
+def motions(R: Array, t: Array, stride: int) -> tuple[Array, Array]:
+    """Motions `V_k^-1 V_k+stride` of N poses, as (N - stride) rotations and translations."""
+    count = len(t) - stride
+    rotations, translations = np.empty((count, 3, 3)), np.empty((count, 3))
+    for k in range(count):
+        _inverse_times(R[k], t[k], R[k + stride], t[k + stride], rotations[k], translations[k])
     return rotations, translations
 
 

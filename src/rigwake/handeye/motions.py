@@ -98,27 +98,30 @@ class Steps:
     segments: NDArray[np.int64]
 
 
-def steps_between(reference: Sampled, member: Sampled, absolute: bool) -> Steps:
-    """Pair two sampled trajectories, as poses (`absolute`) or as motions from each time to the next."""
+def steps_between(reference: Sampled, member: Sampled, absolute: bool, stride: int = 1) -> Steps:
+    """Pair two sampled trajectories, as poses (`absolute`) or as motions from each time to the `stride`-th next."""
     valid = (reference.segments >= 0) & (member.segments >= 0)
     if absolute:
         zero = np.zeros_like(member.twists)
         return Steps(
             reference.world_from_body, member.world_from_body, zero, member.twists, valid, member.segments
         )
-    unbroken = (np.diff(reference.segments) == 0) & (np.diff(member.segments) == 0)
+    start, end = slice(None, -stride), slice(stride, None)
+    unbroken = (reference.segments[start] == reference.segments[end]) & (
+        member.segments[start] == member.segments[end]
+    )
     return Steps(
-        _motions(reference.world_from_body),
-        _motions(member.world_from_body),
-        member.twists[:-1],
-        member.twists[1:],
-        valid[:-1] & valid[1:] & unbroken,
-        member.segments[1:],
+        _motions(reference.world_from_body, stride),
+        _motions(member.world_from_body, stride),
+        member.twists[start],
+        member.twists[end],
+        valid[start] & valid[end] & unbroken,
+        member.segments[end],
     )
 
 
-def _motions(world_from_body: SE3) -> SE3:
-    return SE3(*kernels.motions(world_from_body.rotation, world_from_body.translation))
+def _motions(world_from_body: SE3, stride: int) -> SE3:
+    return SE3(*kernels.motions(world_from_body.rotation, world_from_body.translation, stride))
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,7 +36,8 @@ def covariance(problem: HandeyeProblem, estimate: Estimate) -> Array:
 
     Sandwich `H^-1 M H^-1` with H the genuine information. M is the raw information if the noise is known; it
     exceeds H by what the errors of the Jacobians add. If the noise was learnt, M is not less than the
-    scatter of the scores over blocks of time, which holds correlation that no model foresaw.
+    scatter of the scores over blocks of time, which holds correlation that no model foresaw; errors of poses
+    that last for a while (increments are filtered white, poses are not) count as fewer than there are poses.
     """
     equations = estimate.equations
     units = useful_units(problem.layouts)
@@ -44,7 +45,7 @@ def covariance(problem: HandeyeProblem, estimate: Estimate) -> Array:
     middle = np.eye(len(split.genuine))
     if not problem.has_known_noise:
         values, vectors = np.linalg.eigh(split.basis.T @ _scatter(equations) @ split.basis)
-        middle = (vectors * np.maximum(values, 1.0)) @ vectors.T
+        middle = (vectors * np.maximum(values, _memory(estimate) if problem.absolute else 1.0)) @ vectors.T
     outer = split.basis / split.genuine
     far = _OPEN_UNITS * split.open
     whole = outer @ middle @ outer.T + far @ far.T
@@ -57,6 +58,21 @@ def _scatter(equations: Equations) -> Array:
     scores = equations.scores[equations.used]
     blocks = np.array([part.sum(axis=0) for part in np.array_split(scores, min(_BLOCKS, len(scores)))])
     return np.asarray(blocks.T @ blocks * (len(blocks) / max(len(blocks) - 1, 1)))
+
+
+def _memory(estimate: Estimate) -> float:
+    """How many poses in a row amount to one independent error: `(1 + rho) / (1 - rho)`, rho their correlation
+    with the pose before, of rotation or translation, whichever lasts longer."""
+    longest = 1.0
+    for m, r in enumerate(estimate.residuals):
+        valid = estimate.valid[:, m]
+        pairs = valid[1:] & valid[:-1]
+        for part in (slice(0, 3), slice(3, 6)):
+            before, after = r[:-1, part][pairs], r[1:, part][pairs]
+            scale = np.sqrt(np.sum(before**2) * np.sum(after**2))
+            rho = float(np.sum(before * after) / scale) if scale > 0 else 0.0
+            longest = max(longest, (1 + rho) / max(1 - rho, 1e-3))
+    return longest
 
 
 def open_directions(

@@ -52,7 +52,7 @@ class Curve:
         times = trajectory.times_s
         # contiguous copies: the kernels are compiled for one layout only
         poses = SE3(trajectory.world_from_body.rotation.copy(), trajectory.world_from_body.translation.copy())
-        increments = kernels.tangents(*kernels.motions(poses.rotation, poses.translation))
+        increments = kernels.tangents(*kernels.motions(poses.rotation, poses.translation, 1))
         steps = np.diff(times)
         period = float(np.median(steps))
         longest = 10 * period if max_gap_s is None else max_gap_s
