@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import sys
 import time
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -17,14 +18,15 @@ from calibrated_rigs import boat, camera, without_vertical
 from report_folders import GOOD_CHECKS, circle, many_cameras, write_folder, write_residuals, write_tracks
 from rigwake.calibration import CalibratedCamera, Calibration, UndeterminedDirection, save_calibration
 from rigwake.cli.main import build_app
-from rigwake.errors import InputError
+from rigwake.errors import InputError, UsageError
 from rigwake.geometry.se3 import SE3
 from rigwake.report import build_report, load_report_content, summary_lines
 from rigwake.report.charts import Series, line_chart, ticks
-from rigwake.report.extrinsics import directions, looks
+from rigwake.report.extrinsics import directions, looks, two_digits
 from rigwake.report.figures import write_figures
 from rigwake.report.motion import motion_of, paths_in_one_world
 from rigwake.report.pictures import BUDGET_BYTES
+from rigwake.report.rerun_log import log_to_rerun
 from rigwake.report.verdict import judge
 
 
@@ -309,7 +311,47 @@ def test_rerun_recording(folder: Path, tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     content = (tmp_path / "rig.rrd").read_bytes()
     assert content[:3] == b"RRF"
-    assert len(content) > 10_000
+    for entity in (b"/world/rig/front/image", b"/world/rig/port", b"/world/path"):
+        assert entity in content
+
+
+def test_a_viewer_that_cannot_start_says_so(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rerun = pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
+    content = load_report_content(folder)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    if sys.platform == "linux":
+        with pytest.raises(UsageError, match="no display"):
+            log_to_rerun(content, None, view=True)
+
+    def fail(stream: object) -> None:
+        raise RuntimeError("Failed to find Rerun Viewer executable in PATH.\n\nYou can install ...")
+
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(rerun.RecordingStream, "spawn", fail)
+    with pytest.raises(UsageError, match=r"did not start: Failed to find .*PATH\. Write") as caught:
+        log_to_rerun(content, None, view=True)
+    assert "--rrd" in caught.value.remedy
+
+
+def test_the_first_guess_is_compared_in_its_own_frame(tmp_path: Path) -> None:
+    rig = boat()
+    front = rig.cameras["front"].rig_from_cam
+    in_front = {n: replace(c, rig_from_cam=front.inverse() * c.rig_from_cam) for n, c in rig.cameras.items()}
+    save_calibration(rig, tmp_path / "calibration.yaml")
+    save_calibration(replace(rig, reference="front", cameras=in_front), tmp_path / "initial_rig.yaml")
+    text = build_report(tmp_path).read_text()
+    assert "Positions in the frame of front." in text
+    steps = re.findall(r"<td>(−?\d+) → (−?\d+)</td>", text)
+    assert len(steps) == 3 * len(rig.cameras)
+    assert all(before == after for before, after in steps)
+
+
+@pytest.mark.parametrize(
+    ("std", "words"), [(0.0174, "0.017"), (4.0, "4.0"), (52.4, "52"), (131.0, "131"), (0.0, "0.0")]
+)
+def test_deviations_have_two_digits(std: float, words: str) -> None:
+    assert two_digits(std) == words
 
 
 @pytest.mark.slow

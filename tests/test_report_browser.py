@@ -190,6 +190,16 @@ def test_print_shows_every_panel(browser, pages: dict[str, Path]) -> None:
     assert not browser.find_element(By.ID, "tab-rig").is_displayed()
 
 
+def test_paper_is_light_and_shows_views_of_hidden_panels(browser, pages: dict[str, Path]) -> None:
+    open_page(browser, pages["good"], dark=True)
+    drawn = "return document.getElementById('path3d').dataset.drawn"
+    assert not browser.execute_script(drawn)
+    browser.execute_cdp_cmd("Page.printToPDF", {"printBackground": True})
+    assert int(browser.execute_script(drawn)) > 10
+    assert browser.execute_script("return document.documentElement.dataset.theme") is None
+    assert sum(browser.find_element(By.ID, tab).is_displayed() for tab in TABS) == 1
+
+
 def test_without_scripts_everything_is_there(browser, pages: dict[str, Path]) -> None:
     browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     browser.get(pages["good"].as_uri())

@@ -11,8 +11,8 @@ from markupsafe import Markup, escape
 from rigwake.geometry.so3 import Array
 from rigwake.report.reduce import ImageMap
 
-WIDTH, HEIGHT = 480.0, 210.0
-_LEFT, _RIGHT, _TOP, _BOTTOM = 54.0, 10.0, 10.0, 42.0
+WIDTH, HEIGHT = 480.0, 220.0
+_LEFT, _RIGHT, _TOP, _BOTTOM = 54.0, 26.0, 26.0, 42.0
 COLOURS = 8
 """Length of the palette; series beyond it differ by dashes as well."""
 
@@ -70,7 +70,7 @@ def line_chart(
         parts.append(
             f'<text class="tick" x="{_LEFT - 6:.1f}" y="{v + 4:.1f}" text-anchor="end">{_label(y)}</text>'
         )
-    for x in ticks(x_low, x_high, 8):
+    for x in ticks(x_low, x_high):
         u = _LEFT + (x - x_low) * sx
         parts.append(
             f'<text class="tick" x="{u:.1f}" y="{HEIGHT - _BOTTOM + 16:.1f}" text-anchor="middle">{_label(x)}</text>'
@@ -80,8 +80,7 @@ def line_chart(
     parts.append(
         f'<text class="axis" x="{(WIDTH + _LEFT) / 2:.1f}" y="{HEIGHT - 6:.1f}" '
         f'text-anchor="middle">{escape(x_label)}</text>'
-        f'<text class="axis" x="14" y="{HEIGHT / 2 - 10:.1f}" text-anchor="middle" '
-        f'transform="rotate(-90 14 {HEIGHT / 2 - 10:.1f})">{escape(y_label)}</text>'
+        f'<text class="axis" x="4" y="14">{escape(y_label)}</text>'
     )
     return _svg(title, WIDTH, HEIGHT, parts, "chart")
 

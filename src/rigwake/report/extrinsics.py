@@ -95,9 +95,19 @@ def number(value: float, digits: int) -> str:
     return f"{value + 0.0:.{digits}f}".replace("-", "−")
 
 
+def decimals(std: float) -> int:
+    """How many decimals show two digits of a standard deviation."""
+    return max(0, 1 - int(np.floor(np.log10(std)))) if std > 0 else 1
+
+
+def two_digits(std: float) -> str:
+    """A standard deviation with two digits, never as a power of ten: 0.017, 4.0, 52, 130."""
+    return f"{std:.{decimals(std)}f}"
+
+
 def plus_minus(std: float, unit: str) -> str:
     """`± 1.2 mm`, empty where the deviation is not known."""
-    return f"± {std:.2g} {unit}" if np.isfinite(std) else ""
+    return f"± {two_digits(std)} {unit}" if np.isfinite(std) else ""
 
 
 def looks(camera: CalibratedCamera, reference: str) -> str:
@@ -157,7 +167,7 @@ def overview(calibration: Calibration) -> list[Row]:
 def worst_deg(std_deg: Sequence[float] | Array) -> str:
     """The largest of the standard deviations of rotation."""
     finite = np.asarray(std_deg)[np.isfinite(std_deg)]
-    return f"{finite.max():.2g}°" if len(finite) else "unknown"
+    return f"{two_digits(finite.max())}°" if len(finite) else "unknown"
 
 
 def time_offset(camera: CalibratedCamera) -> Value:
@@ -165,5 +175,8 @@ def time_offset(camera: CalibratedCamera) -> Value:
     if camera.time_offset_s is None:
         return Value(camera.name, "not estimated")
     std = camera.time_offset_std_s
-    deviation = "" if std is None else plus_minus(1e3 * std, "ms")
-    return Value(camera.name, number(1e3 * camera.time_offset_s, 2), deviation)
+    if std is None or not np.isfinite(std):
+        return Value(camera.name, number(1e3 * camera.time_offset_s, 2))
+    return Value(
+        camera.name, number(1e3 * camera.time_offset_s, decimals(1e3 * std)), plus_minus(1e3 * std, "ms")
+    )

@@ -15,9 +15,10 @@ from markupsafe import Markup
 from rigwake import __version__
 from rigwake.atomic import write_text_atomic
 from rigwake.calibration.yaml_file import plain
+from rigwake.geometry.so3 import Array
 from rigwake.report.charts import Series, arrow_scale, image_map, line_chart, top_view
 from rigwake.report.content import RIG_TRAJECTORY, ReportContent, load_report_content
-from rigwake.report.extrinsics import directions, number, overview, plus_minus, time_offset
+from rigwake.report.extrinsics import directions, number, overview, plus_minus, time_offset, two_digits
 from rigwake.report.motion import Motion, motion_of, paths_in_one_world
 from rigwake.report.pictures import embed_pictures, mask_uri
 from rigwake.report.scene import path_scene, rig_scene
@@ -87,7 +88,11 @@ def _values(content: ReportContent) -> dict[str, Any]:
         "unreadable": unreadable,
         "checks": plain(calibration.checks),
         "provenance": plain(calibration.provenance),
+        "steps": _first_guess(content),
         "statistics": {name: plain(c.statistics) for name, c in calibration.cameras.items() if c.statistics},
+        "statistic_names": list(
+            dict.fromkeys(key for c in calibration.cameras.values() for key in c.statistics)
+        ),
     }
 
 
@@ -99,6 +104,24 @@ def _json(value: Any) -> Markup:
     """JSON that cannot end the script element it stands in."""
     text = json.dumps(plain(value), separators=(",", ":"), allow_nan=False)
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
+
+
+def _first_guess(content: ReportContent) -> dict[str, tuple[Array, Array]]:
+    """Per camera the position (metres) of the first guess and of the result, in the frame of the first guess."""
+    first, result = content.initial, content.calibration
+    if first is None:
+        return {}
+    pairs = {
+        name: (c.rig_from_cam, result.cameras[name].rig_from_cam)
+        for name, c in first.cameras.items()
+        if name in result.cameras
+    }
+    if first.reference == result.reference:
+        return {name: (a.translation, b.translation) for name, (a, b) in pairs.items()}
+    if first.reference not in result.cameras:
+        return {}
+    first_from_rig = result.cameras[first.reference].rig_from_cam.inverse()
+    return {name: (a.translation, (first_from_rig * b).translation) for name, (a, b) in pairs.items()}
 
 
 _SIGMA_FLOOR, _SIGMA_CEILING = 1e-4, 1.0  # degrees and metres alike: the ends of the bars
@@ -117,7 +140,7 @@ def _sigma_rows(content: ReportContent) -> list[tuple[str, list[tuple[str, float
             elif not np.isfinite(value):
                 cells.append(("unknown", None))
             else:
-                text = f"{value:.2g}°" if axis < 3 else f"{1e3 * value:.2g} mm"
+                text = f"{two_digits(value)}°" if axis < 3 else f"{two_digits(1e3 * value)} mm"
                 span = np.log(max(value, _SIGMA_FLOOR) / _SIGMA_FLOOR) / np.log(_SIGMA_CEILING / _SIGMA_FLOOR)
                 cells.append((text, float(np.clip(100 * span, 1, 100))))
         rows.append((name, cells))

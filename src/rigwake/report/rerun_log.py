@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,10 @@ from rigwake.report.motion import thin
 
 
 def log_to_rerun(content: ReportContent, rrd: Path | None, view: bool) -> None:
-    """Write an `.rrd` file, show it in the viewer, or both. UsageError if rerun is not installed."""
+    """Write an `.rrd` file, show it in the viewer, or both.
+
+    Raises UsageError if rerun is not installed, or if the viewer cannot start.
+    """
     try:
         import rerun
     except ImportError as error:
@@ -28,8 +33,22 @@ def log_to_rerun(content: ReportContent, rrd: Path | None, view: bool) -> None:
         _log(rerun, stream, content)
     if view:
         stream = rerun.RecordingStream("rigwake")
+        _show(rerun, stream, content)
+
+
+def _show(rerun: Any, stream: Any, content: ReportContent) -> None:
+    """Start the viewer, which pip puts beside the interpreter, where the PATH need not lead."""
+    remedy = "Write a file with --rrd rig.rrd, and open it where there is a display: rerun rig.rrd"
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise UsageError("There is no display for the rerun viewer.", remedy=remedy)
+    beside = str(Path(sys.executable).parent)
+    os.environ["PATH"] = os.pathsep.join([beside, os.environ.get("PATH", "")])
+    try:
         stream.spawn()
         _log(rerun, stream, content)
+    except RuntimeError as error:
+        reason = str(error).strip().partition("\n")[0]
+        raise UsageError(f"The rerun viewer did not start: {reason}", remedy=remedy) from error
 
 
 def _log(rerun: Any, stream: Any, content: ReportContent) -> None:

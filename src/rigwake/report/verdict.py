@@ -119,8 +119,11 @@ def _precision(calibration: Calibration) -> list[Reason]:
             continue
         name = max(worst, key=lambda n: worst[n])
         holds = worst[name] <= limit
+        where = (
+            "where it is determined, " if any(c.undetermined for c in calibration.cameras.values()) else ""
+        )
         words = (
-            f"{what} known to {worst[name] * factor:.2g}{unit} (1σ) or better; the least sure is {name}"
+            f"{where}{what} known to {worst[name] * factor:.2g}{unit} (1σ) or better; the least sure is {name}"
             f"{'' if holds else f'; good means at most {limit * factor:g}{unit}'}."
         )
         reasons.append(

@@ -101,6 +101,7 @@ class View {
     this.scene = scene; // middle and radius of what is shown
     this.home = { azimuth: -2.2, elevation: 0.55, zoom: 1 };
     Object.assign(this, this.home);
+    this.from = this.home;
     this.pointers = new Map();
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
@@ -138,6 +139,7 @@ class View {
       top: [-Math.PI / 2, Math.PI / 2 - 1e-3], side: [-Math.PI / 2, 0], ahead: [0, 0],
       home: [this.home.azimuth, this.home.elevation],
     }[name];
+    this.from = { azimuth, elevation };
     Object.assign(this, { azimuth, elevation, zoom: 1 });
     this.draw();
   }
@@ -173,7 +175,8 @@ class View {
     const [ca, sa, ce, se] = [this.azimuth, this.elevation].flatMap((x) => [Math.cos(x), Math.sin(x)]);
     const towards = [ce * ca, ce * sa, se], right = [-sa, ca, 0], up = [-se * ca, -se * sa, ce];
     const { middle, radius } = this.scene;
-    const distance = 6 * radius, scale = (0.55 * Math.min(width * 0.8, height) * this.zoom) / radius;
+    const parts = this.content();
+    const distance = 6 * radius, scale = this.fit(parts, width, height, distance) * this.zoom;
     const place = (point) => {
       const p = add(point, times(middle, -1));
       const shrink = distance / (distance - dot(p, towards));
@@ -183,11 +186,26 @@ class View {
       const points = part.line || part.face || [part.dot || part.text];
       return points.reduce((sum, p) => sum + dot(p, towards), 0) / points.length;
     };
-    const parts = this.content();
     for (const part of parts) part.depth = part.text ? Infinity : depth(part) + (part.face ? -1e-6 : 0);
     parts.sort((a, b) => a.depth - b.depth);
     for (const part of parts) this.paint(pen, part, place);
     canvas.dataset.drawn = parts.length;
+  }
+
+  // pixels per metre at which everything fits from where the view was last sent: turning does not change it
+  fit(parts, width, height, distance) {
+    const { azimuth, elevation } = this.from;
+    const [ca, sa, ce, se] = [azimuth, elevation].flatMap((x) => [Math.cos(x), Math.sin(x)]);
+    const towards = [ce * ca, ce * sa, se], right = [-sa, ca, 0], up = [-se * ca, -se * sa, ce];
+    let across = 1e-6, along = 1e-6;
+    for (const part of parts)
+      for (const point of part.doubt ? [] : part.line || part.face || [part.dot || part.text]) {
+        const p = add(point, times(this.scene.middle, -1));
+        const shrink = distance / (distance - dot(p, towards));
+        across = Math.max(across, Math.abs(dot(p, right)) * shrink);
+        along = Math.max(along, Math.abs(dot(p, up)) * shrink);
+      }
+    return Math.min((0.46 * width) / across, (0.46 * height) / along);
   }
 
   paint(pen, part, place) {
@@ -241,7 +259,8 @@ function ellipsoid(centre, sigmaAxes, factor, colour) {
         add(centre, add(times(sigmaAxes[i], factor * Math.cos(t)), times(sigmaAxes[j], factor * Math.sin(t))))
       );
     }
-    parts.push({ face: ring, colour, alpha: 0.12 }, { line: ring, colour, alpha: 0.8, width: 1 });
+    parts.push({ face: ring, colour, alpha: 0.12, doubt: true });
+    parts.push({ line: ring, colour, alpha: 0.8, width: 1, doubt: true });
   }
   return parts;
 }
@@ -312,6 +331,20 @@ if (rigCanvas) {
 }
 const pathCanvas = document.getElementById("path3d");
 if (pathCanvas) views.push(new View(pathCanvas, pathParts, scenes.paths));
+
+// ---- paper: light, and with every view drawn, also those whose panel is hidden
+let themeOnScreen;
+addEventListener("beforeprint", () => {
+  themeOnScreen = root.dataset.theme;
+  root.dataset.theme = "light";
+  document.querySelectorAll("section").forEach((section) => section.classList.remove("away"));
+  views.forEach((view) => view.draw());
+});
+addEventListener("afterprint", () => {
+  if (themeOnScreen) root.dataset.theme = themeOnScreen;
+  else delete root.dataset.theme;
+  select(tabs.find((tab) => tab.getAttribute("aria-selected") === "true"));
+});
 
 root.classList.add("scripted");
 select(tabs.find((tab) => "#" + tab.getAttribute("aria-controls") === location.hash) || tabs[0]);
