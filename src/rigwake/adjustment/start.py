@@ -47,16 +47,15 @@ def first_rig(
     models: Mapping[str, CameraModel],
     imu: ImuStream | None = None,
     gnss: GnssStream | None = None,
-    *,
-    first_offsets_s: Mapping[str, float] | None = None,
 ) -> FirstRig:
     """First values of the rig, whose frame is the IMU where there is one, else the leading camera.
 
-    trajectories: `world_from_cam` by camera, up to scale or metric. first_offsets_s: guesses of the clocks.
+    trajectories: `world_from_cam` by camera, up to scale or metric.
+
     Raises UnobservableError when no camera can lead: none can be tied to IMU or GNSS, or none has a scale.
     """
     leader = _choose_leader(trajectories)
-    lead = _lead(trajectories[leader], imu, gnss, (first_offsets_s or {}).get(leader))
+    lead = _lead(trajectories[leader], imu, gnss)
     result, failed = _tie_others(lead.world_from_cam, trajectories, leader)
     cameras = {
         leader: _camera(leader, models[leader], lead.rig_from_cam, lead.time_offset_s, held=imu is None)
@@ -122,11 +121,9 @@ class _Lead:
     notes: tuple[str, ...]
 
 
-def _lead(
-    trajectory: Trajectory, imu: ImuStream | None, gnss: GnssStream | None, offset_s: float | None
-) -> _Lead:
+def _lead(trajectory: Trajectory, imu: ImuStream | None, gnss: GnssStream | None) -> _Lead:
     if imu is not None or gnss is not None:
-        found = metric_start(trajectory, imu, gnss, time_offset_s=offset_s)
+        found = metric_start(trajectory, imu, gnss)
         return _Lead(
             found.world_from_cam,
             found.world_from_rig,

@@ -202,85 +202,102 @@ def _integrate_all(  # type: ignore[no-untyped-def]
 ):
     """One row of the outputs per interval; `vectors` holds velocity, position and final rate."""
     last = len(times) - 2
-    A, B, work = np.eye(9), np.zeros(9), np.empty((9, 9))
-    w0, w1, a0, a1, step = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    turn, Jr, R1 = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    H0, H1, H1t, Rg1 = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    mean_gyro = np.empty((3, 3))
+    A, B, work, scratch = np.eye(9), np.zeros(9), np.empty((9, 9)), np.empty((8, 3, 3))
+    w0, w1, a0, a1 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for n in range(len(starts)):
-        R, v, p = rotation[n], vectors[n, 0], vectors[n, 1]
-        R[:], v[:], p[:], by_bias[n], covariance[n] = np.eye(3), 0.0, 0.0, 0.0, 0.0
-        Rg, Vg, Va, Pg, Pa = by_bias[n, 0], by_bias[n, 1], by_bias[n, 2], by_bias[n, 3], by_bias[n, 4]
+        R, moved, slopes, spread = rotation[n], vectors[n], by_bias[n], covariance[n]
+        R[:], moved[:], slopes[:], spread[:] = np.eye(3), 0.0, 0.0, 0.0
         t, end = starts[n], ends[n]
         forward = end >= t
         k = min(max(np.searchsorted(times, t, side="right") - 1, 0), last)
         if not forward and k > 0 and times[k] >= t:
             k -= 1
-        _sample(times, gyro, t, k, w0)
-        _sample(times, accel, t, k, a0)
-        for i in range(3):
-            w0[i] -= gyro_bias[n, i]
-            a0[i] -= accel_bias[n, i]
+        _bias_free(times, gyro, t, k, gyro_bias[n], w0)
+        _bias_free(times, accel, t, k, accel_bias[n], a0)
         while t != end:
             if forward:
                 reached = end if k >= last else min(end, times[k + 1])
             else:
                 reached = end if k <= 0 else max(end, times[k])
-            dt = reached - t
-            _sample(times, gyro, reached, k, w1)
-            _sample(times, accel, reached, k, a1)
-            for i in range(3):
-                w1[i] -= gyro_bias[n, i]
-                a1[i] -= accel_bias[n, i]
-            for i in range(3):
-                step[i] = 0.5 * (w0[i] + w1[i]) * dt
-            _exp3(step, turn, Jr)
-            _matmul3(R, turn, R1)
-            _minus_rotated_hat(R, a0, H0)
-            _minus_rotated_hat(R1, a1, H1)
-            # H1t: d(R1 a1) by the right tangent of R, through R1 = R turn
-            for i in range(3):
-                for j in range(3):
-                    H1t[i, j] = H1[i, 0] * turn[j, 0] + H1[i, 1] * turn[j, 1] + H1[i, 2] * turn[j, 2]
-            # right tangent of R1 by the gyro bias: turn^T Rg - Jr dt
-            for i in range(3):
-                for j in range(3):
-                    carried = turn[0, i] * Rg[0, j] + turn[1, i] * Rg[1, j] + turn[2, i] * Rg[2, j]
-                    Rg1[i, j] = carried - Jr[i, j] * dt
-            size = abs(dt)
-            for i in range(3):
-                f0 = R[i, 0] * a0[0] + R[i, 1] * a0[1] + R[i, 2] * a0[2]
-                f1 = R1[i, 0] * a1[0] + R1[i, 1] * a1[1] + R1[i, 2] * a1[2]
-                p[i] += v[i] * dt + (2 * f0 + f1) * dt * dt / 6
-                v[i] += (f0 + f1) * dt / 2
-                for j in range(3):
-                    g0 = H0[i, 0] * Rg[0, j] + H0[i, 1] * Rg[1, j] + H0[i, 2] * Rg[2, j]
-                    g1 = H1[i, 0] * Rg1[0, j] + H1[i, 1] * Rg1[1, j] + H1[i, 2] * Rg1[2, j]
-                    Pg[i, j] += Vg[i, j] * dt + (2 * g0 + g1) * dt * dt / 6
-                    Pa[i, j] += Va[i, j] * dt - (2 * R[i, j] + R1[i, j]) * dt * dt / 6
-                    mean_gyro[i, j] = (g0 + g1) * dt / 2
-                    Va[i, j] -= (R[i, j] + R1[i, j]) * dt / 2
-                    A[i, j] = turn[j, i]
-                    A[3 + i, j] = (H0[i, j] + H1t[i, j]) * dt / 2
-                    A[6 + i, j] = (2 * H0[i, j] + H1t[i, j]) * dt * dt / 6
-                A[6 + i, 3 + i] = dt
-            for i in range(3):
-                for j in range(3):
-                    Vg[i, j] += mean_gyro[i, j]
-            gyro_bridge, accel_bridge = 0.0, 0.0
-            if k <= last and times[k + 1] - times[k] > noise[4]:
-                gyro_bridge, accel_bridge = noise[2] * size**3 / 12, noise[3] * size**3 / 12
-            for i in range(3):
-                B[i] = noise[0] * size + gyro_bridge
-                B[3 + i] = noise[1] * size + accel_bridge
-                B[6 + i] = (noise[1] * size + accel_bridge) * size * size / 3
-            _spread(covariance[n], A, B, work)
-            for i in range(3):
-                w0[i], a0[i] = w1[i], a1[i]
-                for j in range(3):
-                    R[i, j], Rg[i, j] = R1[i, j], Rg1[i, j]
+            _bias_free(times, gyro, reached, k, gyro_bias[n], w1)
+            _bias_free(times, accel, reached, k, accel_bias[n], a1)
+            _advance(reached - t, w0, w1, a0, a1, R, moved, slopes, A, scratch)
+            _step_noise(noise, abs(reached - t), times[k + 1] - times[k], B)
+            _spread(spread, A, B, work)
+            w0[:], a0[:] = w1, a1
             t = reached
-            k += 1 if forward else -1
-            k = min(max(k, 0), last)
-        for i in range(3):
-            vectors[n, 2, i] = w0[i]
+            k = min(max(k + (1 if forward else -1), 0), last)
+        moved[2] = w0
+
+
+@njit(cache=True)
+def _bias_free(times, signal, t, index, bias, out):  # type: ignore[no-untyped-def]
+    _sample(times, signal, t, index, out)
+    for i in range(3):
+        out[i] -= bias[i]
+
+
+@njit(cache=True)
+def _advance(dt, w0, w1, a0, a1, R, vectors, by_bias, A, scratch):  # type: ignore[no-untyped-def]
+    """One step between rates w0, w1 and accelerations a0, a1 at its ends: increments, their derivatives by the
+    biases, and the transition A (9, 9) of their errors."""
+    turn, Jr, R1, H0, H1, H1t, Rg1 = (
+        scratch[0], scratch[1], scratch[2], scratch[3], scratch[4], scratch[5], scratch[6],
+    )  # fmt: skip
+    Rg, angles = by_bias[0], scratch[7, 0]
+    for i in range(3):
+        angles[i] = 0.5 * (w0[i] + w1[i]) * dt
+    _exp3(angles, turn, Jr)
+    _matmul3(R, turn, R1)
+    _minus_rotated_hat(R, a0, H0)
+    _minus_rotated_hat(R1, a1, H1)
+    for i in range(3):
+        for j in range(3):
+            # d(R1 a1) by the right tangent of R, through R1 = R turn
+            H1t[i, j] = H1[i, 0] * turn[j, 0] + H1[i, 1] * turn[j, 1] + H1[i, 2] * turn[j, 2]
+            # right tangent of R1 by the gyro bias: turn^T Rg - Jr dt
+            carried = turn[0, i] * Rg[0, j] + turn[1, i] * Rg[1, j] + turn[2, i] * Rg[2, j]
+            Rg1[i, j] = carried - Jr[i, j] * dt
+            A[i, j] = turn[j, i]
+            A[3 + i, j] = (H0[i, j] + H1t[i, j]) * dt / 2
+            A[6 + i, j] = (2 * H0[i, j] + H1t[i, j]) * dt * dt / 6
+        A[6 + i, 3 + i] = dt
+    _move(dt, a0, a1, R, R1, vectors[0], vectors[1])
+    _move_by_bias(dt, R, R1, H0, H1, Rg1, by_bias)
+    R[:], Rg[:] = R1, Rg1
+
+
+@njit(cache=True)
+def _move(dt, a0, a1, R, R1, v, p):  # type: ignore[no-untyped-def]
+    """Velocity and position, with a force that varies linearly."""
+    for i in range(3):
+        f0 = R[i, 0] * a0[0] + R[i, 1] * a0[1] + R[i, 2] * a0[2]
+        f1 = R1[i, 0] * a1[0] + R1[i, 1] * a1[1] + R1[i, 2] * a1[2]
+        p[i] += v[i] * dt + (2 * f0 + f1) * dt * dt / 6
+        v[i] += (f0 + f1) * dt / 2
+
+
+@njit(cache=True)
+def _move_by_bias(dt, R, R1, H0, H1, Rg1, by_bias):  # type: ignore[no-untyped-def]
+    """Derivatives of velocity and position by both biases."""
+    Rg, Vg, Va, Pg, Pa = by_bias[0], by_bias[1], by_bias[2], by_bias[3], by_bias[4]
+    for i in range(3):
+        for j in range(3):
+            g0 = H0[i, 0] * Rg[0, j] + H0[i, 1] * Rg[1, j] + H0[i, 2] * Rg[2, j]
+            g1 = H1[i, 0] * Rg1[0, j] + H1[i, 1] * Rg1[1, j] + H1[i, 2] * Rg1[2, j]
+            Pg[i, j] += Vg[i, j] * dt + (2 * g0 + g1) * dt * dt / 6
+            Pa[i, j] += Va[i, j] * dt - (2 * R[i, j] + R1[i, j]) * dt * dt / 6
+            Vg[i, j] += (g0 + g1) * dt / 2
+            Va[i, j] -= (R[i, j] + R1[i, j]) * dt / 2
+
+
+@njit(cache=True)
+def _step_noise(noise, size, sample_step, B):  # type: ignore[no-untyped-def]
+    """B (9,): what sensor noise adds in a step of this size (s); across a gap, what the signal may have done unseen."""
+    gyro_bridge, accel_bridge = 0.0, 0.0
+    if sample_step > noise[4]:
+        gyro_bridge, accel_bridge = noise[2] * size**3 / 12, noise[3] * size**3 / 12
+    for i in range(3):
+        B[i] = noise[0] * size + gyro_bridge
+        B[3 + i] = noise[1] * size + accel_bridge
+        B[6 + i] = (noise[1] * size + accel_bridge) * size * size / 3

@@ -3,34 +3,27 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 from rigwake.errors import EstimationError, UnobservableError, UsageError
 from rigwake.geometry.so3 import Array
-from rigwake.odometry.gyro import GyroAlignment, align_gyro, camera_rotations
-from rigwake.odometry.level import up_in_camera
 from rigwake.odometry.loop_closure import find_loops, joined_tracks
+from rigwake.odometry.measure import Progress, measure_camera
 from rigwake.odometry.metric import MetricStart, metric_start
 from rigwake.odometry.monocular import estimate_monocular
 from rigwake.odometry.options import OdometryOptions
 from rigwake.odometry.result import OdometryResult
 from rigwake.odometry.seed import SeedOptions, estimate_seed
-from rigwake.odometry.self_calibration import RefinedLens, refine_lens
 from rigwake.odometry.smoother import SmoothedOdometry, smooth
 from rigwake.odometry.turning import estimate_turning
 from rigwake.recording import CameraStream, GnssStream, ImuStream
-from rigwake.tracking.front_ends import track_camera
-from rigwake.tracking.hull import find_hull
-from rigwake.tracking.masks import CameraMask, lens_mask, mask_from_file
+from rigwake.tracking.masks import CameraMask
 from rigwake.tracking.options import TrackingOptions
-from rigwake.tracking.turns import visual_turns
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
-Progress = Callable[[str, int, int], None]
 Method = Literal["adjusted", "seed"]
 
 
@@ -42,7 +35,6 @@ class CameraOdometryOptions:
     hull: look for the own boat in view. horizon: leave out what lies below the horizon (needs an IMU).
     mask_file: picture of the camera's size, white where it may be used.
     loops: recognise places seen before and join their tracks; without it this is done only where the odometry broke.
-    refine_lens: without IMU and GNSS, refine distortion and principal point where the images contradict them.
     """
 
     method: Method = "adjusted"
@@ -53,7 +45,6 @@ class CameraOdometryOptions:
     horizon: bool = True
     mask_file: Path | None = None
     loops: bool = False
-    refine_lens: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +53,6 @@ class CameraOdometry:
 
     trajectory: the result: metric where a sensor gave metres (`scale_source`), else up to scale.
     visual, start, smoothed: the steps, None where they were not taken. notes: what was left out or bridged.
-    lens: the refined one that the bearings of `tracks` are by, None where the one given is right.
     seconds: wall time by stage.
     """
 
@@ -73,7 +63,6 @@ class CameraOdometry:
     visual: OdometryResult | None = None
     start: MetricStart | None = None
     smoothed: SmoothedOdometry | None = None
-    lens: RefinedLens | None = None
     notes: tuple[str, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -123,55 +112,21 @@ class _Run:
         now = time.perf_counter()
         self.seconds[stage], self.stage_started = now - self.stage_started, now
 
-    def _mask(self) -> CameraMask:
-        self.progress("masks", 0, 1)
-        mask = lens_mask(self.stream)
-        if self.options.mask_file is not None:
-            given = mask_from_file(self.options.mask_file, mask.width_px, mask.height_px)
-            mask = mask.with_region("file", ~given.usable)
-        if self.options.hull:
-            try:
-                mask = mask.with_region("hull", find_hull(self.stream, mask.usable))
-            except (UnobservableError, EstimationError) as error:
-                self.notes.append(f"own hull not looked for: {error.cause}")
-        self._done("masks")
-        return mask
-
-    def _gyro(self) -> GyroAlignment | None:
-        if self.imu is None:
-            return None
-        self.progress("aligning the gyroscope", 0, 1)
-        try:
-            return align_gyro(visual_turns(self.stream), self.imu)
-        except (UnobservableError, EstimationError) as error:
-            self.notes.append(f"tracking is not aided by the gyroscope: {error.cause}")
-            return None
-        finally:
-            self._done("gyroscope")
-
-    def _tracks(self, mask: CameraMask, gyro: GyroAlignment | None) -> Tracks:
-        up_cam: Array | None = None
-        if self.options.horizon and gyro is not None and self.imu is not None:
-            up_cam = up_in_camera(self.imu, gyro, self.stream.timestamps_ns)
-        total = len(self.stream)
-        tracks = track_camera(
-            self.stream,
-            self.options.tracking,
-            mask,
-            up_cam=up_cam,
-            progress=lambda done: self.progress("tracking", done, total),
-        )
-        self._done("tracking")
-        return tracks
-
     def _measured(self) -> tuple[CameraMask, Tracks, Array | None]:
-        mask = self._mask()
-        gyro = self._gyro()
-        tracks = self._tracks(mask, gyro)
-        rotations = None
-        if gyro is not None and self.imu is not None:
-            rotations = camera_rotations(self.imu, gyro, tracks.timestamps_ns)
-        return mask, tracks, rotations
+        wanted = self.options
+        found = measure_camera(
+            self.stream,
+            self.imu,
+            wanted.tracking,
+            self.progress,
+            hull=wanted.hull,
+            horizon=wanted.horizon,
+            mask_file=wanted.mask_file,
+        )
+        self.notes += found.notes
+        self.seconds |= found.seconds
+        self.stage_started = time.perf_counter()
+        return found.mask, found.tracks, found.rotations
 
     def seed(self) -> CameraOdometry:
         """The baseline: frame to frame, no map."""
@@ -187,10 +142,6 @@ class _Run:
             visual = self._visual(tracks, rotations)
         except EstimationError as error:
             return self._turning(mask, tracks, error)
-        lens = self._lens(tracks, visual)
-        if lens is not None:
-            self.model, tracks = lens.camera, lens.tracks
-            visual = self._visual(tracks, rotations)
         if self.options.loops or visual.counts.segments > 1:
             tracks, visual = self._closed(tracks, visual, rotations)
         self._done("odometry")
@@ -208,7 +159,6 @@ class _Run:
             visual,
             start,
             smoothed,
-            lens,
             tuple(self.notes),
             self.seconds,
         )
@@ -225,19 +175,6 @@ class _Run:
             rotations=rotations,
             progress=lambda done: self.progress("odometry", min(done, total), total),
         )
-
-    def _lens(self, tracks: Tracks, visual: OdometryResult) -> RefinedLens | None:
-        """A better lens, where vision is alone and the one given does not fit."""
-        if not self.options.refine_lens or self.imu is not None or self.gnss is not None:
-            return None
-        self.progress("checking the lens", 0, 1)
-        lens = refine_lens(tracks, self.model, visual)
-        if lens is not None:
-            self.notes.append(
-                f"the intrinsics given do not fit the images: distortion and principal point were refined by "
-                f"{lens.shift_px:.1f} px (RMS), which takes away {100 * lens.gain:.0f} % of the adjustment's cost"
-            )
-        return lens
 
     def _closed(
         self, tracks: Tracks, visual: OdometryResult, rotations: Array | None

@@ -1,0 +1,100 @@
+"""What one camera measures before any motion is estimated: its mask, its turns against the gyro, its tracks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigwake.errors import EstimationError, UnobservableError
+from rigwake.geometry.so3 import Array
+from rigwake.odometry.gyro import GyroAlignment, align_gyro, camera_rotations
+from rigwake.odometry.level import up_in_camera
+from rigwake.recording import CameraStream, ImuStream
+from rigwake.tracking.front_ends import track_camera
+from rigwake.tracking.hull import find_hull
+from rigwake.tracking.masks import CameraMask, lens_mask, mask_from_file
+from rigwake.tracking.options import TrackingOptions
+from rigwake.tracking.turns import visual_turns
+from rigwake.tracks import Tracks
+
+Progress = Callable[[str, int, int], None]
+"""Told a stage, and how much of it is done of how much in all."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMeasurement:
+    """mask: where was looked. tracks: what was followed. rotations: (F, 3, 3) of the tracks' frames by the gyro, None
+    without one. notes: what was left out, and why. seconds: wall time by stage."""
+
+    mask: CameraMask
+    tracks: Tracks
+    rotations: Array | None
+    notes: tuple[str, ...]
+    seconds: dict[str, float]
+
+
+def measure_camera(
+    stream: CameraStream,
+    imu: ImuStream | None,
+    tracking: TrackingOptions,
+    progress: Progress,
+    *,
+    hull: bool = True,
+    horizon: bool = True,
+    mask_file: Path | None = None,
+) -> CameraMeasurement:
+    """Mask, gyro and tracks of a camera; the gyro tells where the horizon is, and below it nothing is tracked.
+
+    hull: look for the own boat in view. horizon: leave out what lies below it. mask_file: a picture of the camera's
+    size, white where it may be used. A hull that is not found and a gyro that does not fit are noted and done
+    without. Raises EstimationError where nothing can be tracked.
+    """
+    notes: list[str] = []
+    marks = [time.perf_counter()]
+    progress("looking for lens border and hull", 0, 1)
+    mask = _mask(stream, hull, mask_file, notes)
+    marks.append(time.perf_counter())
+    gyro = None
+    if imu is not None:
+        progress("comparing its turns with the gyro", 0, 1)
+        gyro = _gyro(stream, imu, notes)
+    marks.append(time.perf_counter())
+    up_cam = None
+    if horizon and gyro is not None and imu is not None:
+        up_cam = up_in_camera(imu, gyro, stream.timestamps_ns)
+    total = max(len(stream), 1)
+    tracks = track_camera(
+        stream, tracking, mask, up_cam=up_cam, progress=lambda done: progress("tracking", done, total)
+    )
+    marks.append(time.perf_counter())
+    rotations = None
+    if gyro is not None and imu is not None:
+        rotations = camera_rotations(imu, gyro, tracks.timestamps_ns)
+    stages = ("masks", "gyroscope", "tracking")
+    seconds = {stage: marks[k + 1] - marks[k] for k, stage in enumerate(stages)}
+    return CameraMeasurement(mask, tracks, rotations, tuple(notes), seconds)
+
+
+def _mask(stream: CameraStream, hull: bool, mask_file: Path | None, notes: list[str]) -> CameraMask:
+    """Lens border, what was masked by hand, and the own hull."""
+    mask = lens_mask(stream)
+    if mask_file is not None:
+        given = mask_from_file(mask_file, mask.width_px, mask.height_px)
+        mask = mask.with_region("file", ~given.usable)
+    if hull:
+        try:
+            mask = mask.with_region("hull", find_hull(stream, mask.usable))
+        except (UnobservableError, EstimationError) as error:
+            notes.append(f"own hull not looked for: {error.cause}")
+    return mask
+
+
+def _gyro(stream: CameraStream, imu: ImuStream, notes: list[str]) -> GyroAlignment | None:
+    """How camera and IMU are turned towards each other, roughly; None where that cannot be told yet."""
+    try:
+        return align_gyro(visual_turns(stream), imu)
+    except (UnobservableError, EstimationError) as error:
+        notes.append(f"tracking is not aided by the gyroscope: {error.cause}")
+        return None
