@@ -111,6 +111,8 @@ def _columns(layouts: Sequence[Layout]) -> list[slice]:
 
 
 def _times(matrices: Array, vectors: Array) -> Array:
+    if len(matrices) == 1:
+        return np.asarray(vectors @ matrices[0].T)
     return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
 
 

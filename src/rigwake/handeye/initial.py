@@ -12,8 +12,8 @@ Translation and scales then follow linearly. Directions without information stay
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from rigwake.errors import UnobservableError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
+from rigwake.handeye import kernels
 from rigwake.handeye.motions import Layout, Mounting
 from rigwake.handeye.problem import HandeyeProblem
 from rigwake.handeye.resample import Sampled
@@ -89,7 +90,7 @@ def _motions(reference: Sampled, member: Sampled, stride: int) -> _Motions:
     index = index[:: max(1, len(index) // _MAX_MOTIONS)]
 
     def between(world_from_body: SE3) -> SE3:
-        return world_from_body[index].inverse() * world_from_body[index + stride]
+        return SE3(*kernels.motions(world_from_body.rotation, world_from_body.translation, index, stride))
 
     return _Motions(
         between(reference.world_from_body), between(member.world_from_body), member.segments[index]
@@ -97,7 +98,7 @@ def _motions(reference: Sampled, member: Sampled, stride: int) -> _Motions:
 
 
 def _candidates(motions: _Motions, layout: Layout, segments: int) -> Iterator[tuple[SE3, Array]]:
-    turns_a, turns_b = so3.log(motions.reference.rotation), so3.log(motions.member.rotation)
+    turns_a, turns_b = (kernels.rotation_vectors(x.rotation) for x in (motions.reference, motions.member))
     by_turning = _kabsch(turns_a, turns_b)
     yield _with_translation(motions, by_turning, layout, segments)
     yield _with_translation(motions, _turned_about_axis(motions, by_turning, turns_b), layout, segments)
@@ -118,11 +119,10 @@ def _kabsch(a: Array, b: Array) -> Array:
 
 def _turned_about_axis(motions: _Motions, rotation: Array, turns_b: Array) -> Array:
     """`rotation` turned about the main axis of turning so that the translations agree best."""
-    _, _, Vt = np.linalg.svd(turns_b, full_matrices=False)
-    axis = rotation @ Vt[0]
+    axis = rotation @ np.linalg.eigh(turns_b.T @ turns_b)[1][:, -1]
     way = motions.member.translation @ rotation.T
     along = (way @ axis)[:, None] * axis
-    across, quarter = way - along, np.asarray(np.cross(axis, way))
+    across, quarter = way - along, way @ so3.hat(axis).T
     columns = np.stack([across, quarter, along], axis=2)
     lever = np.eye(3) - motions.reference.rotation
     system = np.concatenate([columns, lever], axis=2).reshape(-1, 6)
@@ -165,18 +165,34 @@ def _lever_noise(motions: _Motions, rotation: Array) -> float:
 
 def _least_squares(system: Array, right: Array, noise: float) -> Array:
     """The solution along the singular directions that stand out of `noise`, zero along the others."""
-    U, values, Vt = np.linalg.svd(system, full_matrices=False)
-    kept = values > max(noise, _WEAK * float(values[0]))
-    return np.asarray(Vt[kept].T @ ((right @ U[:, kept]) / values[kept]))
+    squares, V = np.linalg.eigh(system.T @ system)
+    values = np.sqrt(np.maximum(squares, 0.0))
+    kept = values > max(noise, _WEAK * float(values[-1]))
+    return np.asarray(V[:, kept] @ ((right @ system @ V[:, kept]) / squares[kept]))
 
 
 def _misfit(motions: _Motions, X: SE3, scales: Array) -> float:
     """How badly `A X = X B` holds: the likelihood of noise of unknown levels, up to constants."""
-    member = SE3(motions.member.rotation, motions.member.translation * scales[motions.segments, None])
-    left, right = motions.reference * X, X * member
-    turned = np.mean((left.rotation - right.rotation) ** 2)
-    moved = np.mean((left.translation - right.translation) ** 2)
+    A, B = motions.reference, motions.member
+    turned, moved = kernels.misfit(
+        A.rotation,
+        A.translation,
+        B.rotation,
+        B.translation,
+        scales[motions.segments],
+        np.ascontiguousarray(X.rotation),
+        X.translation,
+    )
     return float(np.log(turned + 1e-20) + np.log(moved + 1e-20))
+
+
+def with_worlds(problem: HandeyeProblem, mountings: Sequence[Mounting]) -> list[Mounting]:
+    """The mountings with those gauges between the worlds that fit them best, where `problem` has any."""
+    reference, members = problem.sampled(mountings)
+    return [
+        replace(x, worlds=_worlds(reference, member, x.ref_from_member, np.exp(x.log_scales), layout))
+        for x, member, layout in zip(mountings, members, problem.layouts, strict=True)
+    ]
 
 
 def _worlds(reference: Sampled, member: Sampled, X: SE3, scales: Array, layout: Layout) -> SE3 | None:

@@ -102,13 +102,41 @@ def _inverse_times(Ra: Array, ta: Array, Rb: Array, tb: Array, R: Array, t: Arra
 
 
 @njit(cache=True)
-def motions(R: Array, t: Array, stride: int) -> tuple[Array, Array]:
-    """Motions `V_k^-1 V_k+stride` of N poses, as (N - stride) rotations and translations."""
-    count = len(t) - stride
-    rotations, translations = np.empty((count, 3, 3)), np.empty((count, 3))
-    for k in range(count):
-        _inverse_times(R[k], t[k], R[k + stride], t[k + stride], rotations[k], translations[k])
+def motions(R: Array, t: Array, starts: NDArray[np.int64], stride: int) -> tuple[Array, Array]:
+    """Motions `V_k^-1 V_k+stride` of the poses k in `starts`, as rotations and translations."""
+    rotations, translations = np.empty((len(starts), 3, 3)), np.empty((len(starts), 3))
+    for i in range(len(starts)):
+        k = starts[i]
+        _inverse_times(R[k], t[k], R[k + stride], t[k + stride], rotations[i], translations[i])
     return rotations, translations
+
+
+@njit(cache=True)
+def rotation_vectors(R: Array) -> Array:
+    """Logarithms (N, 3) of N rotations."""
+    out = np.empty((len(R), 3))
+    for k in range(len(R)):
+        _rotation_vector(R[k], out[k])
+    return out
+
+
+@njit(cache=True)
+def misfit(
+    AR: Array, At: Array, BR: Array, Bt: Array, scales: Array, XR: Array, Xt: Array
+) -> tuple[float, float]:
+    """Mean squares of the rotation and the translation entries of `A X - X B`; B scaled by (N,) `scales`."""
+    R1, t1, R2, t2 = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
+    scaled, turned, moved = np.empty(3), 0.0, 0.0
+    for k in range(len(At)):
+        for i in range(3):
+            scaled[i] = Bt[k, i] * scales[k]
+        _times(AR[k], At[k], XR, Xt, R1, t1)
+        _times(XR, Xt, BR[k], scaled, R2, t2)
+        for i in range(3):
+            moved += (t1[i] - t2[i]) ** 2
+            for j in range(3):
+                turned += (R1[i, j] - R2[i, j]) ** 2
+    return turned / (9 * len(At)), moved / (3 * len(At))
 
 
 @njit(cache=True)
@@ -231,6 +259,42 @@ def agreed_motions(
 
 
 @njit(cache=True)
+def jacobians(
+    adjoints: Array,
+    ways: Array,
+    twists_before: Array,
+    twists_after: Array,
+    scales: Array,
+    segments: NDArray[np.int64],
+    valid: NDArray[np.bool_],
+    world_count: int,
+    has_clock: bool,
+    scale_count: int,
+) -> Array:
+    """(N, 6, P) of the residuals by mounting, worlds, clock and logarithms of the scales; zero if not valid."""
+    clock = 6 + 6 * world_count
+    out = np.zeros((len(valid), 6, clock + has_clock + scale_count))
+    for k in range(len(valid)):
+        if not valid[k]:
+            continue
+        J, s = out[k], segments[k]
+        moved = 0 if world_count == 0 else 6 + 6 * min(s, world_count - 1)
+        for i in range(6):
+            J[i, i] = 1.0
+            for j in range(6):
+                J[i, moved + j] -= adjoints[k, i, j]
+        if has_clock:
+            for i in range(6):
+                J[i, clock] = twists_after[k, i] * (1.0 if i < 3 else scales[s])
+                for j in range(6):
+                    J[i, clock] -= adjoints[k, i, j] * twists_before[k, j] * (1.0 if j < 3 else scales[s])
+        if s < scale_count:
+            for i in range(3):
+                J[3 + i, clock + has_clock + s] = -ways[k, i]
+    return out
+
+
+@njit(cache=True)
 def normal_block(Jm: Array, Jn: Array, W: Array, rho: Array, steps: NDArray[np.int64]) -> Array:
     """`sum_k rho_k Jm_k^T W_k Jn_k` over the steps; W (1 or len(steps), 6, 6)."""
     p, q = Jm.shape[2], Jn.shape[2]
@@ -239,18 +303,16 @@ def normal_block(Jm: Array, Jn: Array, W: Array, rho: Array, steps: NDArray[np.i
         k, w = steps[i], i if len(W) > 1 else 0
         for a in range(6):
             for c in range(q):
-                WJ[a, c] = 0.0
-            for b in range(6):
-                weight = W[w, a, b] * rho[i]
-                if weight != 0.0:
-                    for c in range(q):
-                        WJ[a, c] += weight * Jn[k, b, c]
-        for a in range(6):
-            for r in range(p):
-                value = Jm[k, a, r]
-                if value != 0.0:
-                    for c in range(q):
-                        total[r, c] += value * WJ[a, c]
+                value = 0.0
+                for b in range(6):
+                    value += W[w, a, b] * Jn[k, b, c]
+                WJ[a, c] = rho[i] * value
+        for r in range(p):
+            for c in range(q):
+                value = 0.0
+                for a in range(6):
+                    value += Jm[k, a, r] * WJ[a, c]
+                total[r, c] += value
     return total
 
 

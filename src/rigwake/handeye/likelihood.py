@@ -44,12 +44,16 @@ _LONGEST_TURN, _LONGEST_WAY = 0.5, 20.0  # radians, metres in one step
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The solver's end: unknowns, the normal equations and (N, 6) residuals there, and how it went."""
+    """The solver's end: unknowns, the normal equations and (N, 6) residuals there, and how it went.
+
+    valid, segments: (N, M) steps that a member knows, and the index of its segment.
+    """
 
     mountings: tuple[Mounting, ...]
     equations: Equations
     residuals: tuple[Array, ...]
     valid: NDArray[np.bool_]
+    segments: NDArray[np.int64]
     filters: tuple[Jitter, ...]
     doubt: float
     iterations: int
@@ -130,6 +134,7 @@ def maximise(problem: HandeyeProblem, start: Sequence[Mounting], options: Handey
         solver.latest if moved <= enough else solver.equations(),
         solver.residuals,
         solver.valid,
+        np.stack([s.segments for s in solver.steps], axis=1),
         solver.filters,
         doubt,
         iterations,

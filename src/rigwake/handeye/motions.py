@@ -111,17 +111,13 @@ def steps_between(reference: Sampled, member: Sampled, absolute: bool, stride: i
         member.segments[start] == member.segments[end]
     )
     return Steps(
-        _motions(reference.world_from_body, stride),
-        _motions(member.world_from_body, stride),
+        reference.motions if stride == 1 else reference.motions_over(stride),
+        member.motions if stride == 1 else member.motions_over(stride),
         member.twists[start],
         member.twists[end],
         valid[start] & valid[end] & unbroken,
         member.segments[end],
     )
-
-
-def _motions(world_from_body: SE3, stride: int) -> SE3:
-    return SE3(*kernels.motions(world_from_body.rotation, world_from_body.translation, stride))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,26 +159,18 @@ def linearise(steps: Steps, mounting: Mounting, layout: Layout, reference_errors
         *_frames(mounting),
         np.ascontiguousarray(reference_errors),
     )
-    J = np.zeros((len(adjoints), 6, layout.size))
-    J[:, :, :6] = np.eye(6)
-    if not layout.world_count:
-        J[:, :, :6] -= adjoints
-    elif layout.world_count == 1:
-        J[:, :, 6:12] = -adjoints
-    else:
-        for world in range(layout.world_count):
-            here = steps.segments == world
-            J[here, :, 6 + 6 * world : 12 + 6 * world] = -adjoints[here]
-    if layout.has_clock:
-        unit = np.ones((len(J), 6))
-        unit[:, 3:] = np.exp(mounting.log_scales)[steps.segments, None]
-        before = steps.twists_before * unit
-        J[:, :, layout.clock.start] = steps.twists_after * unit - (adjoints @ before[:, :, None])[..., 0]
-    for segment in range(layout.scale_count):
-        here = steps.segments == segment
-        J[here, 3:, layout.scales.start + segment] = -ways[here]
-    if not steps.valid.all():
-        J[~steps.valid] = 0
+    J = kernels.jacobians(
+        adjoints,
+        ways,
+        steps.twists_before,
+        steps.twists_after,
+        np.exp(mounting.log_scales),
+        steps.segments,
+        steps.valid,
+        layout.world_count,
+        layout.has_clock,
+        layout.scale_count,
+    )
     return Linearised(J, adjoints, ways)
 
 

@@ -53,7 +53,7 @@ class HandeyeProblem:
             curve.at(times - self._shift(curve, mounting))
             for curve, mounting in zip(self.members, mountings, strict=True)
         ]
-        return self.reference.at(times), members
+        return self.reference.at_poses if self.pace < 0 else self.reference.at(times), members
 
     def steps(self, mountings: Sequence[Mounting]) -> list[Steps]:
         """Every member paired with the reference."""

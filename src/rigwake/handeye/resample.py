@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,16 @@ class Sampled:
     world_from_body: SE3
     twists: Array
     segments: NDArray[np.int64]
+
+    @cached_property
+    def motions(self) -> SE3:
+        """`V_k^-1 V_k+1` from each time to the next: N - 1 transforms."""
+        return self.motions_over(1)
+
+    def motions_over(self, stride: int) -> SE3:
+        """`V_k^-1 V_k+stride`: N - stride transforms."""
+        V, starts = self.world_from_body, np.arange(len(self.segments) - stride)
+        return SE3(*kernels.motions(V.rotation, V.translation, starts, stride))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +63,9 @@ class Curve:
         times = trajectory.times_s
         # contiguous copies: the kernels are compiled for one layout only
         poses = SE3(trajectory.world_from_body.rotation.copy(), trajectory.world_from_body.translation.copy())
-        increments = kernels.tangents(*kernels.motions(poses.rotation, poses.translation, 1))
+        increments = kernels.tangents(
+            *kernels.motions(poses.rotation, poses.translation, np.arange(len(times) - 1), 1)
+        )
         steps = np.diff(times)
         period = float(np.median(steps))
         longest = 10 * period if max_gap_s is None else max_gap_s
@@ -72,6 +85,12 @@ class Curve:
         """Number of segments, counted from 0 to the highest id."""
         assert self.trajectory.segment_ids is not None
         return int(self.trajectory.segment_ids.max()) + 1
+
+    @cached_property
+    def at_poses(self) -> Sampled:
+        """At its own stamps."""
+        assert self.trajectory.segment_ids is not None
+        return Sampled(self.world_from_body, self.twists, self.trajectory.segment_ids)
 
     def at(self, times_s: Array) -> Sampled:
         """Interpolate at `times_s`, seconds after `start_ns`; a tenth of a period past either end is allowed.

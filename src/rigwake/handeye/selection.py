@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigwake.geometry.so3 import Array
-from rigwake.handeye.initial import initial_mountings
+from rigwake.handeye.initial import with_worlds
 from rigwake.handeye.likelihood import Estimate, information_criterion, maximise
 from rigwake.handeye.motions import residuals, steps_between
 from rigwake.handeye.problem import HandeyeProblem, pose_problem
@@ -42,12 +42,11 @@ def without_drift(
         return problem, estimate
     has_clock = [layout.has_clock for layout in problem.layouts]
     as_poses = pose_problem(reference, members, replace(options, noise="poses"), has_clock)
-    offsets = [mounting.time_offset_s for mounting in estimate.mountings]
-    other = maximise(as_poses, initial_mountings(as_poses, offsets), options)
+    other = maximise(as_poses, with_worlds(as_poses, estimate.mountings), options)
     if not other.converged:
         return problem, estimate
     better = information_criterion(as_poses, other) < information_criterion(problem, estimate)
-    return (as_poses, other) if better or _stays(as_poses, other) else (problem, estimate)
+    return (as_poses, other) if better or _stays(other) else (problem, estimate)
 
 
 def _saturates(problem: HandeyeProblem, estimate: Estimate) -> bool:
@@ -66,12 +65,11 @@ def _saturates(problem: HandeyeProblem, estimate: Estimate) -> bool:
     return True
 
 
-def _stays(as_poses: HandeyeProblem, estimate: Estimate) -> bool:
+def _stays(estimate: Estimate) -> bool:
     """No segment's residuals, of rotation or translation, wander."""
-    for m, r in enumerate(estimate.residuals):
-        segments = as_poses.steps(estimate.mountings)[m].segments
-        for segment in range(as_poses.members[m].segment_count):
-            rows = r[estimate.valid[:, m] & (segments == segment)]
+    for r, valid, segments in zip(estimate.residuals, estimate.valid.T, estimate.segments.T, strict=True):
+        for segment in np.unique(segments[valid]):
+            rows = r[valid & (segments == segment)]
             if any(wandering(rows[:, part]) > _STATIONARY for part in (slice(0, 3), slice(3, 6))):
                 return False
     return True
