@@ -16,6 +16,7 @@ from rigwake.odometry.monocular import estimate_monocular
 from rigwake.odometry.options import OdometryOptions
 from rigwake.odometry.result import OdometryResult
 from rigwake.odometry.seed import SeedOptions, estimate_seed
+from rigwake.odometry.self_calibration import RefinedLens, refine_lens
 from rigwake.odometry.smoother import SmoothedOdometry, smooth
 from rigwake.odometry.turning import estimate_turning
 from rigwake.recording import CameraStream, GnssStream, ImuStream
@@ -35,6 +36,7 @@ class CameraOdometryOptions:
     hull: look for the own boat in view. horizon: leave out what lies below the horizon (needs an IMU).
     mask_file: picture of the camera's size, white where it may be used.
     loops: recognise places seen before and join their tracks; without it this is done only where the odometry broke.
+    refine_lens: without IMU and GNSS, refine distortion and principal point where the images contradict them.
     """
 
     method: Method = "adjusted"
@@ -45,6 +47,7 @@ class CameraOdometryOptions:
     horizon: bool = True
     mask_file: Path | None = None
     loops: bool = False
+    refine_lens: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +56,7 @@ class CameraOdometry:
 
     trajectory: the result: metric where a sensor gave metres (`scale_source`), else up to scale.
     visual, start, smoothed: the steps, None where they were not taken. notes: what was left out or bridged.
+    lens: the refined one that the bearings of `tracks` are by, None where the one given is right.
     seconds: wall time by stage.
     """
 
@@ -63,6 +67,7 @@ class CameraOdometry:
     visual: OdometryResult | None = None
     start: MetricStart | None = None
     smoothed: SmoothedOdometry | None = None
+    lens: RefinedLens | None = None
     notes: tuple[str, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -142,6 +147,10 @@ class _Run:
             visual = self._visual(tracks, rotations)
         except EstimationError as error:
             return self._turning(mask, tracks, error)
+        lens = self._lens(tracks, visual)
+        if lens is not None:
+            self.model, tracks = lens.camera, lens.tracks
+            visual = self._visual(tracks, rotations)
         if self.options.loops or visual.counts.segments > 1:
             tracks, visual = self._closed(tracks, visual, rotations)
         self._done("odometry")
@@ -159,6 +168,7 @@ class _Run:
             visual,
             start,
             smoothed,
+            lens,
             tuple(self.notes),
             self.seconds,
         )
@@ -175,6 +185,19 @@ class _Run:
             rotations=rotations,
             progress=lambda done: self.progress("odometry", min(done, total), total),
         )
+
+    def _lens(self, tracks: Tracks, visual: OdometryResult) -> RefinedLens | None:
+        """A better lens, where vision is alone and the one given does not fit."""
+        if not self.options.refine_lens or self.imu is not None or self.gnss is not None:
+            return None
+        self.progress("checking the lens", 0, 1)
+        lens = refine_lens(tracks, self.model, visual)
+        if lens is not None:
+            self.notes.append(
+                f"the intrinsics given do not fit the images: distortion and principal point were refined by "
+                f"{lens.shift_px:.1f} px (RMS), which takes away {100 * lens.gain:.0f} % of the adjustment's cost"
+            )
+        return lens
 
     def _closed(
         self, tracks: Tracks, visual: OdometryResult, rotations: Array | None
