@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 import typer
 import yaml
+from typer.testing import CliRunner
 
 from calibrated_rigs import PINHOLE, boat, without_vertical
-from rigwake.calibration import save_calibration
+from rigwake.calibration import load_calibration, save_calibration
 from rigwake.cli.main import build_app
+from rigwake.evaluate.calibrations import evaluate_calibration
+from rigwake.readers.truth import read_true_rig, rig_in_frame
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.DOTALL)
@@ -106,6 +109,46 @@ def commands_of(page: Path) -> list[list[str]]:
     """The words of every `rigwake ...` line of a code block."""
     lines = re.findall(r"^ {4,}(rigwake [a-z].*)$", page.read_text(), re.MULTILINE)
     return [shlex.split(line, comments=True)[1:] for line in lines if "..." not in line.split("#")[0]]
+
+
+def run_commands(commands: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> str:
+    """Run `rigwake ...` one after the other, without opening a browser; what they said."""
+    monkeypatch.setattr("webbrowser.open", lambda address: True)
+    said = []
+    for words in commands:
+        done = CliRunner().invoke(build_app(), words)
+        assert done.exit_code == 0, (words, done.output, done.exception)
+        said.append(done.output)
+    return "\n".join(said)
+
+
+def test_the_tutorial_runs_from_its_result_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for path in ("OUT/calibration.yaml", "OUT2/calibration.yaml", "harbour_truth/truth.yaml"):
+        save_calibration(boat(), Path(path))
+    commands = commands_of(ROOT / "docs" / "tutorial.md")
+    assert [words[0] for words in commands[:3]] == ["simulate", "inspect", "calibrate"]
+    said = run_commands(commands[3:], monkeypatch)
+    assert "USABLE" in said
+    assert "camera to camera, worst pair: 0.0000°" in said
+    assert Path("cameras.launch").read_text().startswith("<launch>")
+    assert yaml.safe_load(Path("camchain.yaml").read_text())["cam0"]["camera_name"] == "front"
+
+
+@pytest.mark.slow
+def test_the_whole_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    commands = commands_of(ROOT / "docs" / "tutorial.md")
+    commands[0] += ["--duration", "20"]  # shorter than the page's, to save time
+    again = next(i for i, words in enumerate(commands) if "OUT2/calibration.yaml" in words)
+    commands[again] = ["diff", "OUT/calibration.yaml", "OUT/calibration.yaml"]
+    said = run_commands(commands, monkeypatch)
+    assert "Enough to calibrate." in said
+    truth = read_true_rig(tmp_path / "harbour_truth" / "truth.yaml")
+    found = load_calibration(tmp_path / "OUT" / "calibration.yaml")
+    for error in evaluate_calibration(found, rig_in_frame(truth, found.reference)).cameras.values():
+        assert error.rotation_error_deg < 0.1
+        assert error.translation_error_norm_m < 0.05
 
 
 def test_commands_in_the_documentation_exist() -> None:

@@ -67,7 +67,8 @@ def _print(differences: dict[str, CameraDifference], ranges_m: Sequence[float], 
         pixels.add_row(escape(name), *("–" if s is None else f"{s[0]:.2f} / {s[1]:.2f}" for s in shifts))
     print_title(title)
     out.print(moved)
-    out.print("[dim]sigmas: the difference in units of both covariances; about 1: they agree[/dim]")
+    if any(d.sigmas is not None for d in differences.values()):
+        out.print("[dim]sigmas: the difference in units of both covariances; about 1: they agree[/dim]")
     if any(d.shift_px for d in differences.values()):
         print_title("shift of a point, px: median / largest over the image")
         out.print(pixels)
