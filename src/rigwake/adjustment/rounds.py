@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rigwake.adjustment.imu_noise import imu_noise_scales, with_imu_noise
 from rigwake.adjustment.values import AdjustedRig, AdjustmentOptions, AssembledProblem
 from rigwake.bundle.problem import Observations, RigProblem, RigSolution, SolverOptions
 from rigwake.bundle.solver import solve
@@ -36,7 +37,8 @@ def adjust(
     to_be_continued: whether another adjustment starts from this one, so that it need not be exact.
 
     Between rounds an observation beyond the gate is dropped, landmarks left with too few observations go, and
-    each camera's `std_px` is scaled to the spread that its residuals show. Raises EstimationError when too few
+    each camera's `std_px` is scaled to the spread that its residuals show; so are the IMU's densities where
+    its residuals exceed them. Raises EstimationError when too few
     landmarks are left.
     """
     problem = assembled.problem
@@ -54,6 +56,7 @@ def adjust(
             break
         gate = options.gate_stds * (_FIRST_GATE if done == 0 else 1.0)
         problem, kept, scales, lost = drop_outliers(solution, gate, options.min_observations)
+        problem = with_imu_noise(problem, imu_noise_scales(solution))
         factors *= scales
         dropped += lost
         cameras, ids = cameras[kept], ids[kept]

@@ -14,11 +14,13 @@ from rigwake.adjustment.checks import (
     split_half_summary,
 )
 from rigwake.adjustment.hand_over import HandOver, adjust_with_hand_over
+from rigwake.adjustment.imu_noise import imu_noise_factors
 from rigwake.adjustment.rounds import adjust
 from rigwake.adjustment.start import FirstRig, first_rig
 from rigwake.adjustment.values import AdjustedRig, RigMeasurements
 from rigwake.adjustment.verdicts import ReferenceFrame, calibrated_cameras
 from rigwake.bundle.covariance import covariance_of
+from rigwake.bundle.problem import RigProblem
 from rigwake.calibration import Calibration
 from rigwake.config import CalibrateConfig
 from rigwake.errors import InputError, UnobservableError
@@ -143,7 +145,14 @@ def _conclude(
         hand_over=hand_over_errors(solution, handed_over.unused),
         scale_source=first.scale_source,
         converged=solution.report.converged,
+        imu_noise_factors=_imu_noise(selection, solution.problem),
     )
+
+
+def _imu_noise(selection: Selection, problem: RigProblem) -> dict[str, float]:
+    if selection.imu is None or problem.imu is None:
+        return {}
+    return imu_noise_factors(selection.imu, problem.imu)
 
 
 def reference_frame(
