@@ -65,6 +65,28 @@ def test_messages_in_the_faq_are_messages_of_the_program() -> None:
             assert fragment.strip() in known, message
 
 
+def causes_of(error: str) -> list[list[str]]:
+    """The words, without what is inserted, of every cause that is raised as this error."""
+    found = []
+    for path in (ROOT / "src" / "rigwake").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            raised = node.exc if isinstance(node, ast.Raise) else None
+            if isinstance(raised, ast.Call) and raised.args and ast.unparse(raised.func) == error:
+                parts = [n for n in ast.walk(raised.args[0]) if isinstance(n, ast.Constant)]
+                words = [str(part.value).strip() for part in parts]
+                found.append([text for text in words if len(text.split()) >= 2])
+    return found
+
+
+def test_every_message_of_exit_code_3_is_explained() -> None:
+    faq = (ROOT / "docs" / "faq.md").read_text()
+    causes = [words for words in causes_of("UnobservableError") if words]
+    assert len(causes) > 12
+    for words in causes:
+        longest = max(words, key=len)
+        assert any(text.lstrip(": ")[:40] in faq for text in words), f"docs/faq.md lacks: {longest}"
+
+
 def test_the_example_exports_what_the_formats_can_hold(
     tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,3 +187,10 @@ def test_commands_in_the_documentation_exist() -> None:
         }
         used = {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)}
         assert used <= known | {"--help"}, f"{page}: rigwake {verb} {used - known}"
+
+
+def test_every_page_is_in_the_site_and_linked_from_its_start() -> None:
+    pages = {page.name for page in (ROOT / "docs").glob("*.md")}
+    assert pages == set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text()))
+    linked = set(re.findall(r"\]\((\w+\.md)\)", (ROOT / "docs" / "index.md").read_text()))
+    assert pages - linked == {"index.md"}
