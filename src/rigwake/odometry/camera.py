@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from rigwake.cameras.base import CameraModel
 from rigwake.errors import EstimationError, UnobservableError, UsageError
 from rigwake.geometry.so3 import Array
 from rigwake.odometry.loop_closure import find_loops, joined_tracks
@@ -16,7 +17,7 @@ from rigwake.odometry.monocular import estimate_monocular
 from rigwake.odometry.options import OdometryOptions
 from rigwake.odometry.result import OdometryResult
 from rigwake.odometry.seed import SeedOptions, estimate_seed
-from rigwake.odometry.self_calibration import RefinedLens, refine_lens
+from rigwake.odometry.self_calibration import RefinedLens, estimate_refining_lens
 from rigwake.odometry.smoother import SmoothedOdometry, smooth
 from rigwake.odometry.turning import estimate_turning
 from rigwake.recording import CameraStream, GnssStream, ImuStream
@@ -144,13 +145,10 @@ class _Run:
         """Map, then metres."""
         mask, tracks, rotations = self._measured()
         try:
-            visual = self._visual(tracks, rotations)
+            visual, lens = self._first_visual(tracks, rotations)
         except EstimationError as error:
             return self._turning(mask, tracks, error)
-        lens = self._lens(tracks, visual)
-        if lens is not None:
-            self.model, tracks = lens.camera, lens.tracks
-            visual = self._visual(tracks, rotations)
+        tracks = tracks if lens is None else lens.tracks
         if self.options.loops or visual.counts.segments > 1:
             tracks, visual = self._closed(tracks, visual, rotations)
         self._done("odometry")
@@ -186,18 +184,24 @@ class _Run:
             progress=lambda done: self.progress("odometry", min(done, total), total),
         )
 
-    def _lens(self, tracks: Tracks, visual: OdometryResult) -> RefinedLens | None:
-        """A better lens, where vision is alone and the one given does not fit."""
+    def _first_visual(
+        self, tracks: Tracks, rotations: Array | None
+    ) -> tuple[OdometryResult, RefinedLens | None]:
+        """Vision; where it is alone, with a better lens if the one given does not fit."""
         if not self.options.refine_lens or self.imu is not None or self.gnss is not None:
-            return None
-        self.progress("checking the lens", 0, 1)
-        lens = refine_lens(tracks, self.model, visual)
+            return self._visual(tracks, rotations), None
+
+        def estimate(seen: Tracks, model: CameraModel) -> OdometryResult:
+            self.model = model
+            return self._visual(seen, rotations)
+
+        visual, lens = estimate_refining_lens(tracks, self.model, estimate)
         if lens is not None:
             self.notes.append(
                 f"the intrinsics given do not fit the images: distortion and principal point were refined by "
                 f"{lens.shift_px:.1f} px (RMS), which takes away {100 * lens.gain:.0f} % of the adjustment's cost"
             )
-        return lens
+        return visual, lens
 
     def _closed(
         self, tracks: Tracks, visual: OdometryResult, rotations: Array | None

@@ -11,6 +11,7 @@ against distortion and takes the rotations along.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,6 +39,8 @@ _FOCAL = frozenset({"fx", "fy", "f", "a0"})
 _PRIOR_PX = 1.0  # each parameter alone is believed to be so right, over the pixels that were observed
 _MAX_FRAMES = 150
 _MIN_GAIN = 0.03  # of the cost, under which the lens is right as given
+_MIN_LATER_GAIN = 0.01
+_MAX_ROUNDS = 4
 _MIN_VIEWS = 3
 _HELD_STD = 1e-9
 _SOLVER = SolverOptions(loss="cauchy", loss_scale=2.0, tolerance=1e-5, max_iterations=20)
@@ -57,10 +60,32 @@ class RefinedLens:
     gain: float
 
 
-def refine_lens(tracks: Tracks, camera: CameraModel, visual: OdometryResult) -> RefinedLens | None:
+def estimate_refining_lens(
+    tracks: Tracks, camera: CameraModel, estimate: Callable[[Tracks, CameraModel], OdometryResult]
+) -> tuple[OdometryResult, RefinedLens | None]:
+    """Odometry and, where the lens given does not fit, a better lens: in turns, until it changes no more.
+
+    estimate: odometry from tracks and their camera. A wrong lens bends the path, and a bent path hides how wrong
+    the lens is: hence several rounds.
+    """
+    visual, lens = estimate(tracks, camera), None
+    for _ in range(_MAX_ROUNDS):
+        now = (tracks, camera) if lens is None else (lens.tracks, lens.camera)
+        better = refine_lens(*now, visual, min_gain=_MIN_GAIN if lens is None else _MIN_LATER_GAIN)
+        if better is None:
+            break
+        gain = better.gain if lens is None else 1 - (1 - lens.gain) * (1 - better.gain)
+        lens = replace(better, gain=gain, shift_px=_shift_px(camera, better.tracks))
+        visual = estimate(lens.tracks, lens.camera)
+    return visual, lens
+
+
+def refine_lens(
+    tracks: Tracks, camera: CameraModel, visual: OdometryResult, *, min_gain: float = _MIN_GAIN
+) -> RefinedLens | None:
     """Distortion and principal point estimated with motion and points of the longest segment.
 
-    None where that explains the tracks hardly better than the lens as given, or where it cannot be estimated.
+    None where that lowers the adjustment's cost by less than `min_gain`, or where it cannot be estimated.
     Every free parameter has a prior: alone, it moves the observed pixels by one (root mean square).
     """
     problem = _problem(tracks, camera, visual)
@@ -74,13 +99,16 @@ def refine_lens(tracks: Tracks, camera: CameraModel, visual: OdometryResult) -> 
     except RigwakeError:  # a lens beyond its bounds, or too little to adjust: the one given stays
         return None
     gain = 1.0 - solution.report.final_cost / held
-    if gain < _MIN_GAIN or not seen.all():
+    if gain < min_gain or not seen.all():
         return None
-    moved, valid = camera.project(bearings)
-    shift = np.linalg.norm(moved[valid] - tracks.pixels[valid], axis=1)
-    return RefinedLens(
-        refined, replace(tracks, bearings_cam=bearings), float(np.sqrt(np.mean(shift**2))), float(gain)
-    )
+    seen_anew = replace(tracks, bearings_cam=bearings)
+    return RefinedLens(refined, seen_anew, _shift_px(camera, seen_anew), float(gain))
+
+
+def _shift_px(camera: CameraModel, tracks: Tracks) -> float:
+    """Root mean square by which this camera would see the bearings of the tracks elsewhere than they were seen."""
+    moved, valid = camera.project(tracks.bearings_cam)
+    return float(np.sqrt(np.mean(np.sum((moved[valid] - tracks.pixels[valid]) ** 2, axis=1))))
 
 
 def _problem(tracks: Tracks, camera: CameraModel, visual: OdometryResult) -> RigProblem | None:
