@@ -17,11 +17,13 @@ from rigwake.simulate.hull import build_hull
 from rigwake.simulate.imaging import develop, vignetting
 from rigwake.simulate.layout import build_layout
 from rigwake.simulate.record import Shot, build_world, render_recording, work_folder
-from rigwake.simulate.render import Renderer, water_at
+from rigwake.simulate.render import Renderer
 from rigwake.simulate.scenario import ImageNoise, Scenario, Scene, Sea, build_scenario, load_scenario
+from rigwake.simulate.sea_surface import meet_water, water_at
 from rigwake.simulate.selfcheck import corner_errors, motion_agreement
 from rigwake.simulate.setup import Simulation, prepare
-from rigwake.simulate.shading import HULL, LAND, SKY, WATER, water_distance
+from rigwake.simulate.shading import HULL, LAND, SKY, WATER
+from rigwake.simulate.skyline import gather_boxes, in_band, seen_band
 from rigwake.simulate.textures import build_atlas
 from rigwake.simulate.truth import truth_to_dict, write_truth
 from rigwake.simulate.waves import build_wave_field
@@ -62,13 +64,45 @@ def test_rays_end_on_the_surface_of_the_sea(
     water = water_at(SEA, 3.0)
     down = np.deg2rad(down_deg)
     ray = np.array([np.cos(azimuth) * np.cos(down), np.sin(azimuth) * np.cos(down), -np.sin(down)])
-    t = water_distance(water, east, north, 2.0, *ray, 1e-4, np.inf)
+    t = meet_water(water, east, north, 2.0, *ray, 1e-4, 0.5)[0]
     at = np.array([east, north, 2.0]) + t * ray
     k, omega, amplitude = SEA.components()
     phase = k @ at[:2] - omega * 3.0
     height = (amplitude * np.exp(1j * phase)).real
     long_waves = np.linalg.norm(k, axis=1) < 2 * np.pi / 37.3 * 64  # what the two longer tiles resolve well
     assert at[2] == pytest.approx(height[long_waves].sum(), abs=0.02)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    spread_m=st.sampled_from([4.0, 40.0, 900.0]),
+    size_m=st.sampled_from([0.5, 6.0, 80.0]),
+    height_m=st.floats(-1.0, 30.0),
+)
+def test_rays_that_are_not_cast_would_hit_nothing(
+    seed: int, spread_m: float, size_m: float, height_m: float
+) -> None:
+    """Whatever lies on a triangle above the water is inside the band of elevations that is cast."""
+    rng = np.random.default_rng(seed)
+    triangles = rng.uniform(-spread_m, spread_m, (40, 1, 3)) * [1, 1, 0.1]
+    triangles = (triangles + rng.uniform(-size_m, size_m, (40, 3, 3))).astype(np.float32)
+    centres = np.array([0.3, -1.0, height_m]) + rng.uniform(-0.1, 0.1, (5, 3))
+    depth_m = 1.0
+    band = seen_band(gather_boxes(triangles), centres, depth_m)
+    corners = rng.dirichlet(np.ones(3), (50, 40))
+    points = np.einsum("pnc,nca->pna", corners, triangles).reshape(-1, 3)
+    rays = (points - centres[rng.integers(5, size=len(points))])[points[:, 2] > -depth_m]
+    assert all(in_band(band, *ray) for ray in (rays / np.linalg.norm(rays, axis=1, keepdims=True)).tolist())
+
+
+def test_the_open_sky_and_the_water_at_the_bow_are_not_cast() -> None:
+    quay = np.array([[[50.0, -20, 0], [50, 20, 0], [50, 0, 8]]], np.float32)
+    band = seen_band(gather_boxes(quay), np.array([[0.0, 0, 2]]), 0.3)
+    assert in_band(band, 1.0, 0.0, 0.05)
+    assert not in_band(band, 1.0, 0.0, 0.3)
+    assert not in_band(band, 1.0, 0.0, -0.2)
+    assert not in_band(band, -1.0, 0.0, 0.0)
 
 
 SEA = build_wave_field(Sea(hs_m=0.3, tp_s=3.5), 5)

@@ -112,7 +112,7 @@ def _catamaran() -> Hull:
     parts.append(_box((-0.95, 0.8), (-0.55, 0.55), (1.0, 1.07), _WHITE, "panel"))
     parts.append(_box((-0.5, -0.05), (-0.35, 0.35), (1.07, 1.24), _ORANGE, "panel"))
     parts.append(_box((0.1, 0.45), (-0.2, 0.2), (1.07, 1.2), _BLUE, "panel"))
-    response = HullResponse(4.6, 2.3, (1.0, 1.1, 1.2), (0.5, 0.35, 0.45))
+    response = HullResponse(4.6, 2.3, (1.0, 1.1, 1.2), (0.5, 0.4, 0.4))
     return Hull(tuple(parts), response)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from rigwake.cameras.base import CameraModel
 from rigwake.errors import EstimationError
 from rigwake.recording import Image
+from rigwake.simulate.compiled import loop
 from rigwake.simulate.meshes import Floats
 from rigwake.simulate.scenario import ImageNoise
 
@@ -53,12 +56,32 @@ def develop(
     if noise.blur_px > 0:
         light = cv2.GaussianBlur(light, (0, 0), noise.blur_px, borderType=cv2.BORDER_REPLICATE)
     gain = noise.gain * (1 + noise.gain_drift * np.sin(2 * np.pi * time_s / _DRIFT_PERIOD_S + phase))
-    exposed = np.sqrt(np.clip(light * (vignette * gain)[..., None], 0, 15.9)) * (4095 / 4)
-    grey = _TONE[exposed.astype(np.int32)]
-    if noise.read_std > 0 or noise.shot > 0:
-        grain = rng.standard_normal(grey.shape, dtype=np.float32)
-        grey = grey + grain * np.sqrt(noise.read_std**2 + noise.shot * grey)
-    return np.asarray(np.clip(grey[..., ::-1] + 0.5, 0, 255), np.uint8)
+    grain = rng.standard_normal(light.shape, dtype=np.float32)
+    picture = np.empty(light.shape, np.uint8)
+    _expose(np.ascontiguousarray(light), vignette, gain, _TONE, grain, noise.read_std**2, noise.shot, picture)
+    return picture
+
+
+@loop
+def _expose(
+    light: Floats,
+    vignette: Floats,
+    gain: float,
+    tone: Floats,
+    grain: Floats,
+    read_variance: float,
+    shot: float,
+    picture: Image,
+) -> None:
+    """Grey values (H, W, 3) BGR of light (H, W, 3) RGB, with `grain` (unit variance) as noise."""
+    height, width, _ = light.shape
+    for y in range(height):
+        for x in range(width):
+            for channel in range(3):
+                exposed = light[y, x, channel] * vignette[y, x] * gain
+                grey = tone[int(math.sqrt(min(max(exposed, 0.0), 15.9)) * (4095 / 4))]
+                grey += grain[y, x, channel] * math.sqrt(read_variance + shot * grey)
+                picture[y, x, 2 - channel] = int(min(max(grey + 0.5, 0.0), 255.0))
 
 
 def encode(picture: Image, quality: int, colour: bool) -> bytes:

@@ -21,10 +21,11 @@ from rigwake.simulate.meshes import Floats
 from rigwake.simulate.render import Renderer, View
 from rigwake.simulate.scenario import Camera, Scenario
 from rigwake.simulate.scenery import KeepClear, Scenery, build_scenery
+from rigwake.simulate.sea_surface import Water
 from rigwake.simulate.setup import Simulation, build_recording
-from rigwake.simulate.shading import Water
 
 Progress = Callable[[str, int, int], None]
+_RENDERER = 2  # one more whenever the same scenario gives other pictures
 
 
 def build_world(simulation: Simulation) -> tuple[Scenery, Renderer]:
@@ -38,7 +39,8 @@ def build_world(simulation: Simulation) -> tuple[Scenery, Renderer]:
 
 def work_folder(output: Path, scenario: Scenario) -> Path:
     """Where frames wait until the recording is written: beside it, named by all that shapes a frame."""
-    fingerprint = hashlib.sha256(scenario.model_dump_json().encode()).hexdigest()[:12]
+    shaping = f"{_RENDERER} {scenario.model_dump_json()}"
+    fingerprint = hashlib.sha256(shaping.encode()).hexdigest()[:12]
     return output.parent / f".{output.stem}-{fingerprint}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,21 +19,23 @@ from rigwake.simulate.light import Sky, bake_irradiance, build_embree, build_sky
 from rigwake.simulate.meshes import Floats
 from rigwake.simulate.scenario import Weather
 from rigwake.simulate.scenery import Scenery
-from rigwake.simulate.shading import Mirrored, Rays, Surfaces, Water
+from rigwake.simulate.sea_surface import Water, water_at
+from rigwake.simulate.shading import Mirrored, Rays, Surfaces
+from rigwake.simulate.skyline import gather_boxes, seen_band
 from rigwake.simulate.structures import hull_mesh
 from rigwake.simulate.textures import Atlas
-from rigwake.simulate.waves import TILE_CELLS, WaveField
+from rigwake.simulate.waves import WaveField
 
 _CHUNK = 1 << 15
 _BLOCK_PX = 8  # rays are shot block by block: neighbours hit the same triangles and texels
-_LEVELS = 8
 
 
 @dataclass(frozen=True, eq=False)
 class View:
     """One camera's rays, ready to be turned into the world: all sub-pixels that do not see the own hull.
 
-    cam_rays: (N, 3) unit. pixel, row: (N,) which pixel, which image row. width: (N,) radians across.
+    cam_rays: (N, 3) unit. pixel, row: (N,) which pixel, which image row. width: (N,) radians across. rounding: (N,)
+    in 0..1, how each ray of a pixel rounds mip levels.
     The hull's sub-pixels: colour, normal in the rig frame, light of the sky, pixel.
     """
 
@@ -43,6 +46,7 @@ class View:
     pixel: NDArray[np.int32]
     row: NDArray[np.int32]
     width: Floats
+    rounding: Floats
     hull_albedo: Floats
     hull_normal: Floats
     hull_light: Floats
@@ -66,6 +70,7 @@ class Renderer:
         self.sky = build_sky(weather, seed)
         self.atlas = scenery.atlas
         self.embree = build_embree(scenery.mesh)
+        self.boxes = gather_boxes(scenery.mesh.triangles)
         light = bake_irradiance(scenery.mesh, self.embree, self.sky)
         mesh = scenery.mesh
         self.surfaces = _surfaces(
@@ -80,8 +85,9 @@ class Renderer:
         parts = [_lens_rays(model, du, dv) for dv in offsets for du in offsets]
         cam_rays = np.concatenate([rays for rays, _ in parts])
         all_pixels = np.concatenate([pixel for _, pixel in parts])
+        rounding = np.repeat((np.arange(len(parts)) + 0.5) / len(parts), [len(rays) for rays, _ in parts])
         order = np.argsort(_shooting_order(model)[all_pixels], kind="stable")
-        cam_rays, all_pixels = cam_rays[order], all_pixels[order]
+        cam_rays, all_pixels, rounding = cam_rays[order], all_pixels[order], rounding[order]
         widths = pixel_width[all_pixels]
         hull_hit, colour, normal, light = self._trace_hull(hull, rig_from_cam, cam_rays, widths)
         free = ~hull_hit
@@ -93,6 +99,7 @@ class Renderer:
             all_pixels[free],
             (all_pixels[free] // model.width_px).astype(np.int32),
             widths[free],
+            rounding[free].astype(np.float32),
             colour,
             normal,
             light,
@@ -130,8 +137,7 @@ class Renderer:
         height, width = view.shape
         image = np.zeros((height * width, 3), np.float32)
         rotation, centre = _per_row(view, world_from_rig)
-        for start in range(0, len(view.pixel), _CHUNK):
-            rays = self._shoot(view, slice(start, start + _CHUNK), rotation, centre, water.bound)
+        for rays in self._shots(view, rotation, centre, water.bound):
             out = _empty_mirrored(len(rays.pixel))
             count = shading.shade(self.surfaces, water, rays, out, image)
             if count:
@@ -154,27 +160,32 @@ class Renderer:
         ranges = np.full(height * width, np.nan, np.float32)
         labels[view.hull_pixel] = shading.HULL
         rotation, centre = _per_row(view, world_from_rig)
-        for start in range(0, len(view.pixel), _CHUNK):
-            rays = self._shoot(view, slice(start, start + _CHUNK), rotation, centre, water.bound)
+        for rays in self._shots(view, rotation, centre, water.bound):
             shading.classify(water, rays, labels, ranges)
         return TruthImage(labels.reshape(height, width), ranges.reshape(height, width))
 
-    def _shoot(self, view: View, part: slice, rotation: Array, centre: Array, depth_m: float) -> Rays:
-        rays = view.cam_rays[part]
-        origin, direction = np.empty_like(rays), np.empty_like(rays)
-        reach = np.empty(len(rays), np.float32)
-        shading.aim(rays, view.row[part], rotation, centre, depth_m, origin, direction, reach)
-        hit = self.embree.run(origin, direction, reach, output=True)
-        return Rays(
-            origin,
-            direction,
-            view.pixel[part],
-            view.width[part],
-            hit["tfar"],
-            hit["primID"],
-            hit["u"],
-            hit["v"],
-        )
+    def _shots(self, view: View, rotation: Array, centre: Array, depth_m: float) -> Iterator[Rays]:
+        """All rays of a view and what they hit, a chunk at a time; those that can hit nothing are not cast."""
+        band = seen_band(self.boxes, centre, depth_m)
+        for start in range(0, len(view.pixel), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            cam_rays = view.cam_rays[part]
+            rays = np.empty_like(cam_rays), np.empty_like(cam_rays)
+            thrown = np.empty_like(cam_rays), np.empty_like(cam_rays), np.empty(len(cam_rays), np.float32)
+            cast = np.empty(len(cam_rays), np.int32)
+            count = shading.aim(cam_rays, view.row[part], rotation, centre, depth_m, band, rays, cast, thrown)
+            hit = self.embree.run(*(array[:count] for array in thrown), output=True)
+            yield Rays(
+                *rays,
+                view.pixel[part],
+                view.width[part],
+                view.rounding[part],
+                cast,
+                hit["tfar"],
+                hit["primID"],
+                hit["u"],
+                hit["v"],
+            )
 
 
 def _surfaces(
@@ -196,6 +207,7 @@ def _surfaces(
         atlas.starts,
         atlas.sizes,
         atlas.metres,
+        np.log2(atlas.sizes[:, 0] / atlas.metres).astype(np.float32),
         sky.panorama,
         sky.sun,
         sky.horizon.astype(np.float32),
@@ -261,31 +273,3 @@ def _empty_mirrored(count: int) -> Mirrored:
         return np.empty((count, 3), np.float32)
 
     return Mirrored(vectors(), vectors(), np.empty(count, np.int32), plain(), plain(), plain(), plain())
-
-
-def water_at(sea: WaveField, time_s: float) -> Water:
-    """The sea's tiles at a time with their mip levels, and what slope variance each level averages away."""
-    cells, starts, lost, at, highest = [], [], [], 0, 0.0
-    for tile in sea.tiles:
-        surface = tile.surface(time_s)
-        highest += float(np.abs(surface[..., 0]).max())
-        full = float(np.var(surface[..., 1]) + np.var(surface[..., 2])) / 2
-        row, row_lost = [], []
-        for level in range(_LEVELS):
-            cells.append(surface.reshape(-1, 3))
-            row.append(at)
-            at += len(cells[-1])
-            row_lost.append(max(full - float(np.var(surface[..., 1]) + np.var(surface[..., 2])) / 2, 0.0))
-            n = TILE_CELLS >> (level + 1)
-            surface = surface.reshape(n, 2, n, 2, 3).mean(axis=(1, 3))
-        starts.append(row)
-        lost.append(row_lost)
-    lengths = np.array([tile.length_m for tile in sea.tiles], np.float32)
-    return Water(
-        np.concatenate(cells).astype(np.float32),
-        np.array(starts),
-        lengths,
-        np.log2(lengths),
-        np.array(lost, np.float32),
-        max(highest, 1e-3),
-    )

@@ -33,6 +33,8 @@ _WINDOW_PX = 6
 _BLUR_PX = 0.5
 _CAMERA_HEIGHT_M = 300.0
 _IDEAL_SAMPLES = 8  # per pixel and direction
+_FLOW_RIM_PX = 3
+_PATCH_PX = 15  # of the tracks
 _BLACK, _WHITE = 0.027, 0.9  # of the chequered texture
 _OUT_OF_SIGHT = Hull(
     (Tube((0, 0, -2000), (0, 0, -2001), 0.1, 0.1, (1, 1, 1)),), HullResponse(1, 1, (1, 1, 1), (1, 1, 1))
@@ -166,28 +168,29 @@ def motion_agreement(shot: Shot, truth_shot: Shot, first: int, second: int) -> M
         pictures.append(picture)
     seen = renderer.truth(truth_shot.view, shot.row_poses(float(times[first])), seas[0])
     later = renderer.truth(truth_shot.view, shot.row_poses(float(times[second])), seas[1])
-    expected, visible = _static_motion(
+    turned, expected, visible = _static_motion(
         shot, seen.ranges_m, later.ranges_m, float(times[first]), float(times[second])
     )
     dense = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dense.setFinestScale(0)
     flow = dense.calc(pictures[0], pictures[1], np.zeros((*pictures[0].shape, 2), np.float32))
-    inner = _inner(seen.labels == shading.LAND) & visible
-    flow_error = np.linalg.norm(flow - expected, axis=-1)[inner]
-    land, n_land = _klt_share(pictures, expected, inner)
-    water, n_water = _klt_share(pictures, expected, _inner(seen.labels == shading.WATER))
+    on_land, on_water = seen.labels == shading.LAND, seen.labels == shading.WATER
+    flow_error = np.linalg.norm(flow - expected, axis=-1)[_inner(on_land, _FLOW_RIM_PX) & visible]
+    land, n_land = _klt_share(pictures, turned, expected, _inner(on_land, _PATCH_PX // 2) & visible)
+    water, n_water = _klt_share(pictures, turned, expected, _inner(on_water, _PATCH_PX // 2))
     return MotionAgreement(flow_error, land, water, n_land, n_water)
 
 
-def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The mask without a rim of 3 pixels: a patch on an outline sees two things at once."""
-    return cv2.erode(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+def _inner(mask: NDArray[np.bool_], rim_px: int) -> NDArray[np.bool_]:
+    """The mask without its rim: a patch on an outline sees two things at once."""
+    return cv2.erode(mask.astype(np.uint8), np.ones((2 * rim_px + 1, 2 * rim_px + 1), np.uint8)) > 0
 
 
 def _static_motion(
     shot: Shot, ranges: Floats, later: Floats, first_s: float, second_s: float
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Displacement (H, W, 2) in the image of what each pixel sees, were it at rest, and whether it is still seen."""
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Displacement (H, W, 2) in the image by the camera's turn alone, of what each pixel sees, were it at rest, and
+    whether it is still seen."""
     camera = shot.simulation.rig.camera(shot.camera.name)
     assert camera.model is not None
     height, width = ranges.shape
@@ -197,7 +200,8 @@ def _static_motion(
     motion = shot.simulation.motion
     before, after = (motion.world_from_rig(np.array(t)) * camera.rig_from_cam for t in (first_s, second_s))
     distance = np.where(np.isfinite(ranges), ranges, np.nan).ravel()
-    points = (after.inverse() * before) * (rays * distance[:, None])
+    after_from_before = after.inverse() * before
+    points = after_from_before * (rays * distance[:, None])
     known = valid & np.isfinite(points).all(axis=1)
     projected, ok = camera.model.project(np.where(known[:, None], points, 1.0))
     ok &= known
@@ -205,22 +209,33 @@ def _static_motion(
     nearer = later[at[:, 1], at[:, 0]] < 0.97 * np.linalg.norm(points, axis=1) - 0.1
     inside = np.all((projected > 8) & (projected < [width - 9, height - 9]), axis=1)
     visible = ok & inside & ~nearer
-    return (projected - pixels).reshape(height, width, 2), visible.reshape(height, width)
+    far, _ = camera.model.project(np.where(valid[:, None], rays @ after_from_before.rotation.T, 1.0))
+    moved = [(at - pixels).reshape(height, width, 2) for at in (far, projected)]
+    return moved[0], moved[1], visible.reshape(height, width)
 
 
 def _klt_share(
-    pictures: list[NDArray[np.uint8]], expected: Array, mask: NDArray[np.bool_]
+    pictures: list[NDArray[np.uint8]], turned: Array, expected: Array, mask: NDArray[np.bool_]
 ) -> tuple[float, int]:
-    """Share of forward-backward-checked KLT tracks that move as expected, to 1 px, and their number."""
+    """Share of forward-backward-checked KLT tracks that move as expected, to 1 px, and their number.
+
+    They start from where the camera's turn alone takes them, as with a gyro, and need no pyramid: in its coarse
+    levels the black rim of the image circle, which does not move, would be in many patches.
+    """
     first, second = pictures
     corners = cv2.goodFeaturesToTrack(first, 600, 0.005, 7, mask=mask.astype(np.uint8), blockSize=5)
     if corners is None:
         return float("nan"), 0
-    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None, winSize=(15, 15))
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, None, winSize=(15, 15))
+    at = np.round(corners[:, 0]).astype(int)
+    turn = turned[at[:, 1], at[:, 0]][:, None].astype(np.float32)
+    window, flags = (_PATCH_PX, _PATCH_PX), cv2.OPTFLOW_USE_INITIAL_FLOW
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        first, second, corners, corners + turn, winSize=window, maxLevel=0, flags=flags
+    )
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
+        second, first, there, there - turn, winSize=window, maxLevel=0, flags=flags
+    )
     kept = (found & found_back).ravel().astype(bool) & (np.linalg.norm(back - corners, axis=-1).ravel() < 0.5)
-    at = np.round(corners[kept, 0]).astype(int)
-    moved = (there - corners)[kept, 0]
-    error = np.linalg.norm(moved - expected[at[:, 1], at[:, 0]], axis=1)
-    known = np.isfinite(error)
+    error = np.linalg.norm((there - corners)[:, 0] - expected[at[:, 1], at[:, 0]], axis=1)
+    known = kept & np.isfinite(error)
     return float(np.mean(error[known] < 1.0)) if known.any() else float("nan"), int(known.sum())

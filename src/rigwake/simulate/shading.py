@@ -12,26 +12,21 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 from rigwake.geometry.so3 import Array
+from rigwake.simulate.compiled import borrowed, inlined, loop
 from rigwake.simulate.light import SUN_IRRADIANCE
 from rigwake.simulate.meshes import Floats
+from rigwake.simulate.sea_surface import HORIZON_M, Water, bilinear, may_meet_water, meet_water, ripples
+from rigwake.simulate.skyline import in_band
 
 LAND, SKY, WATER, HULL = 60, 120, 180, 240
 _HAZE_M = 3500.0
-_HORIZON_M = 6000.0
-_CAPILLARY_VARIANCE = 6e-4  # slopes of ripples shorter than the shortest tile
-
-# no `nnan`, `ninf`: misses are infinite. Inlined by LLVM: a call would copy the arrays' descriptors each time
-_FAST = {"contract", "reassoc", "arcp", "nsz", "afn"}
-_loop = numba.njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
-_inlined = numba.njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy", forceinline=True)
 
 
 class Surfaces(NamedTuple):
-    """Triangles, textures and sky, as plain arrays."""
+    """Triangles, textures (with the base-2 logarithm of their finest texels per metre) and sky, as plain arrays."""
 
     uv: Floats
     texture: Any
@@ -42,31 +37,23 @@ class Surfaces(NamedTuple):
     starts: Any
     sizes: Any
     metres: Floats
+    octaves: Floats
     panorama: Floats
     sun: Floats
     horizon: Floats
 
 
-class Water(NamedTuple):
-    """Tiles of height and slopes with their mip levels: (M, 3) cells, first cell by (tile, level), edge lengths in
-    metres and their base-2 logarithms, slope variance lost by (tile, level), bound of the height."""
-
-    cells: Floats
-    starts: Any
-    lengths: Floats
-    octaves: Floats
-    lost: Floats
-    bound: float
-
-
 class Rays(NamedTuple):
-    """Rays of a chunk and what they hit: origins, directions (N, 3), pixel, width (radians), distance, triangle
-    (-1: none) and its barycentric coordinates."""
+    """Rays of a chunk: origins, directions (N, 3), pixel, width (radians), how they round mip levels (0..1); which
+    of the hits below is theirs (-1: not cast, nothing there); hits: distance, triangle (-1: none), barycentric
+    coordinates."""
 
     origin: Floats
     direction: Floats
     pixel: Any
     width: Floats
+    rounding: Floats
+    cast: Any
     distance: Floats
     triangle: Any
     u: Floats
@@ -74,7 +61,8 @@ class Rays(NamedTuple):
 
 
 class Mirrored(NamedTuple):
-    """Rays thrown back by water: as `Rays`, with their share of the pixel and the sun's glint, if nothing hides it."""
+    """Rays thrown back by water, one for each half of a pixel's: as `Rays`, with their share of the pixel, the width
+    that they set out with (metres), and the sun's glint, if nothing hides it."""
 
     origin: Floats
     direction: Floats
@@ -85,41 +73,15 @@ class Mirrored(NamedTuple):
     glint: Floats
 
 
-@_inlined
-def _bilinear(texels: Floats, start: int, size: int, u: float, v: float) -> tuple[float, float, float]:
-    x, y = u * size - 0.5, v * size - 0.5
-    fx, fy = math.floor(x), math.floor(y)
-    ax, ay = x - fx, y - fy
-    x0, y0 = int(fx) & (size - 1), int(fy) & (size - 1)
-    x1, y1 = (x0 + 1) & (size - 1), (y0 + 1) & (size - 1)
-    i, j = start + y0 * size, start + y1 * size
-    w00, w01 = (1 - ax) * (1 - ay), ax * (1 - ay)
-    w10, w11 = (1 - ax) * ay, ax * ay
-    a, b, c, d = i + x0, i + x1, j + x0, j + x1
-    return (
-        w00 * texels[a, 0] + w01 * texels[b, 0] + w10 * texels[c, 0] + w11 * texels[d, 0],
-        w00 * texels[a, 1] + w01 * texels[b, 1] + w10 * texels[c, 1] + w11 * texels[d, 1],
-        w00 * texels[a, 2] + w01 * texels[b, 2] + w10 * texels[c, 2] + w11 * texels[d, 2],
-    )
+@inlined
+def _texture(s: Surfaces, number: int, u_m: float, v_m: float, octave: float) -> tuple[float, float, float]:
+    """Colour of a texture at metres along a surface, in the mip level whose texels are `2^octave` metres across."""
+    edge = s.metres[number]
+    level = int(min(max(octave + s.octaves[number], 0.0), s.starts.shape[1] - 1.0))
+    return bilinear(s.texels, s.starts[number, level], s.sizes[number, level], u_m / edge, v_m / edge)
 
 
-@_inlined
-def _texture(s: Surfaces, number: int, u_m: float, v_m: float, width_m: float) -> tuple[float, float, float]:
-    """Colour of a texture at metres along a surface, averaged over a width: trilinear in the mip pyramid."""
-    edge, size = s.metres[number], s.sizes[number, 0]
-    level = math.log2(max(width_m * size / edge, 1e-6))
-    level = min(max(level, 0.0), s.starts.shape[1] - 1.001)
-    low = int(level)
-    share = level - low
-    u, v = u_m / edge, v_m / edge
-    r, g, b = _bilinear(s.texels, s.starts[number, low], s.sizes[number, low], u, v)
-    if share < 0.02:
-        return r, g, b
-    r1, g1, b1 = _bilinear(s.texels, s.starts[number, low + 1], s.sizes[number, low + 1], u, v)
-    return r + share * (r1 - r), g + share * (g1 - g), b + share * (b1 - b)
-
-
-@_inlined
+@inlined
 def _sky(s: Surfaces, dx: float, dy: float, dz: float) -> tuple[float, float, float]:
     height, width = s.panorama.shape[0], s.panorama.shape[1]
     if dz <= 0:
@@ -143,7 +105,7 @@ def _sky(s: Surfaces, dx: float, dy: float, dz: float) -> tuple[float, float, fl
     return r, g, b
 
 
-@_inlined
+@inlined
 def _land(
     s: Surfaces,
     triangle: int,
@@ -154,128 +116,79 @@ def _land(
     pz: float,
     cosine: float,
     width_m: float,
+    rounding: float,
 ) -> tuple[float, float, float]:
-    """Colour of a point on a triangle: texture x weathering x tint x the light baked into its corners."""
+    """Colour of a point on a triangle: texture x weathering x tint x the light baked into its corners.
+
+    Mip levels are not interpolated: each ray of a pixel rounds them its own way, so that their mean is interpolated.
+    """
     w = 1 - u - v
-    uv, light, normal = s.uv[triangle], s.light[triangle], s.normal[triangle]
-    seen = width_m / math.sqrt(max(cosine, 0.04))
-    tu, tv = w * uv[0, 0] + u * uv[1, 0] + v * uv[2, 0], w * uv[0, 1] + u * uv[1, 1] + v * uv[2, 1]
-    r, g, b = _texture(s, s.texture[triangle], tu, tv, seen)
-    if abs(normal[2]) > 0.7:
-        mr, mg, mb = _texture(s, len(s.metres) - 1, px, py, seen)
+    octave = math.log2(np.float32(max(width_m / math.sqrt(max(cosine, 0.04)), 1e-6))) + rounding
+    tu = w * s.uv[triangle, 0, 0] + u * s.uv[triangle, 1, 0] + v * s.uv[triangle, 2, 0]
+    tv = w * s.uv[triangle, 0, 1] + u * s.uv[triangle, 1, 1] + v * s.uv[triangle, 2, 1]
+    r, g, b = _texture(s, s.texture[triangle], tu, tv, octave)
+    if abs(s.normal[triangle, 2]) > 0.7:
+        mu, mv = px, py
     else:
-        mr, mg, mb = _texture(s, len(s.metres) - 1, px * normal[1] - py * normal[0], pz, seen)
-    tint = s.tint[triangle]
+        mu, mv = px * s.normal[triangle, 1] - py * s.normal[triangle, 0], pz
+    mr, mg, mb = _texture(s, len(s.metres) - 1, mu, mv, octave)
+    light_r = w * s.light[triangle, 0, 0] + u * s.light[triangle, 1, 0] + v * s.light[triangle, 2, 0]
+    light_g = w * s.light[triangle, 0, 1] + u * s.light[triangle, 1, 1] + v * s.light[triangle, 2, 1]
+    light_b = w * s.light[triangle, 0, 2] + u * s.light[triangle, 1, 2] + v * s.light[triangle, 2, 2]
     return (
-        r * mr * tint[0] * (w * light[0, 0] + u * light[1, 0] + v * light[2, 0]),
-        g * mg * tint[1] * (w * light[0, 1] + u * light[1, 1] + v * light[2, 1]),
-        b * mb * tint[2] * (w * light[0, 2] + u * light[1, 2] + v * light[2, 2]),
+        r * mr * s.tint[triangle, 0] * light_r,
+        g * mg * s.tint[triangle, 1] * light_g,
+        b * mb * s.tint[triangle, 2] * light_b,
     )
 
 
-@_inlined
-def _tile(water: Water, tile: int, level: int, x: float, y: float) -> tuple[float, float, float]:
-    # +0.5: cell (0, 0) of level 0 lies at the origin, while `_bilinear` puts it half a cell away
-    edge, size = water.lengths[tile], 256 >> level
-    u, v = x / edge + 0.5 / 256, y / edge + 0.5 / 256
-    return _bilinear(water.cells, water.starts[tile, level], size, u, v)
+@inlined
+def _cosine(s: Surfaces, triangle: int, dx: float, dy: float, dz: float) -> float:
+    normal = s.normal[triangle, 0] * dx + s.normal[triangle, 1] * dy + s.normal[triangle, 2] * dz
+    return abs(normal)
 
 
-@_inlined
-def water_distance(
-    water: Water,
-    ox: float,
-    oy: float,
-    oz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    width: float,
-    nearest: float,
-) -> float:
-    """Distance along a ray to the surface of the sea (Newton steps on the two longer tiles), inf if none."""
-    if dz >= -1e-5:
-        return np.inf
-    first, last = (water.bound - oz) / dz, (-water.bound - oz) / dz
-    if first > min(nearest, _HORIZON_M):
-        return np.inf
-    t = -oz / dz
-    seen = width * t / math.sqrt(max(-dz, 0.04))
-    level0 = _nearest_level(water, 0, seen)
-    level1 = _nearest_level(water, 1, seen)
-    close_enough = max(1e-3, 0.5 * seen)  # along the ray: the next step would be far smaller still
-    for _ in range(3):
-        x, y = ox + t * dx, oy + t * dy
-        h0, sx0, sy0 = _tile(water, 0, level0, x, y)
-        h1, sx1, sy1 = _tile(water, 1, level1, x, y)
-        closing = min(dz - (sx0 + sx1) * dx - (sy0 + sy1) * dy, 0.4 * dz)
-        step = (oz + t * dz - h0 - h1) / closing
-        t = min(max(t - step, first), last)
-        if abs(step) < close_enough:
-            break
-    return t
-
-
-@_inlined
-def _nearest_level(water: Water, tile: int, width_m: float) -> int:
-    cell = water.lengths[tile] / 256
-    if width_m < 1.42 * cell:
-        return 0
-    return int(min(math.log2(width_m / cell) + 0.5, 7.0))
-
-
-@_inlined
+@inlined
 def _clear_air(distance_m: float) -> float:
     """Share of light that haze lets through: `exp(-x)` to third order, which is cheaper."""
     x = distance_m / _HAZE_M
     return 1 / (1 + x * (1 + x * (0.5 + x / 6)))
 
 
-@_inlined
-def _slopes(water: Water, x: float, y: float, width_m: float) -> tuple[float, float, float]:
-    """Slopes by x and y averaged over a width, and the variance of what that averages away."""
-    sx = sy = 0.0
-    lost = _CAPILLARY_VARIANCE
-    octave = math.log2(max(width_m, 1e-6)) + 8
-    for tile in range(3):
-        level = min(max(octave - water.octaves[tile], 0.0), 7.0)
-        low = int(level)
-        if low == 7:  # a single cell, all averaged away
-            lost += water.lost[tile, 7]
-            continue
-        share = level - low
-        _, ax, ay = _tile(water, tile, low, x, y)
-        if share > 0.02:
-            _, bx, by = _tile(water, tile, low + 1, x, y)
-            ax, ay = ax + share * (bx - ax), ay + share * (by - ay)
-        sx += ax
-        sy += ay
-        lost += (1 - share) * water.lost[tile, low] + share * water.lost[tile, low + 1]
-    return sx, sy, lost
-
-
-@_inlined
+@inlined
 def _mirror(
-    s: Surfaces, water: Water, rays: Rays, i: int, t: float, out: Mirrored, k: int, image: Floats
-) -> None:
-    """Water met by ray i: the light from below goes into the image, the mirrored ray into `out[k]`."""
+    s: Surfaces,
+    water: Water,
+    rays: Rays,
+    i: int,
+    t: float,
+    long_sx: float,
+    long_sy: float,
+    octave: float,
+    out: Mirrored,
+    k: int,
+    joins: bool,
+    image: Floats,
+) -> int:
+    """Water met by ray i: the light from below goes into the image, the mirrored ray into `out[k]`, or joins the one
+    before. Returns how many there are then."""
     dx, dy, dz = rays.direction[i, 0], rays.direction[i, 1], rays.direction[i, 2]
     x, y = rays.origin[i, 0] + t * dx, rays.origin[i, 1] + t * dy
     width_m = rays.width[i] * t / math.sqrt(max(-dz, 0.04))
-    sx, sy, lost = _slopes(water, x, y, width_m)
+    short_sx, short_sy, lost = ripples(water, x, y, octave, rays.rounding[i])
+    sx, sy = long_sx + short_sx, long_sy + short_sy
     rough = math.sqrt(lost)
     # facets that lean away are hidden at a low angle: those seen lean towards the eye
-    flat = max(math.hypot(dx, dy), 1e-6)
-    lean = rough * max(0.0, 1 + dz / max(2.5 * rough, 0.05)) * 0.8
-    nx, ny, nz = -sx - lean * dx / flat, -sy - lean * dy / flat, 1.0
-    length = math.sqrt(nx * nx + ny * ny + 1)
-    nx, ny, nz = nx / length, ny / length, nz / length
+    flat = math.sqrt(max(dx * dx + dy * dy, 1e-12))
+    lean = rough * max(0.0, 1 + dz / max(2.5 * rough, 0.05)) * 0.8 / flat
+    nx, ny = -sx - lean * dx, -sy - lean * dy
+    nz = 1 / math.sqrt(nx * nx + ny * ny + 1)
+    nx, ny = nx * nz, ny * nz
     facing = max(-(nx * dx + ny * dy + nz * dz), 0.015)
     steep = 1 + rough * (2.69 + rough * (3.62 + 3.24 * rough))  # exp(2.69 rough)
-    fresnel = 0.02 + 0.98 * (1 - facing) ** (5 / steep) / (1 + 22.7 * rough * math.sqrt(rough))
-    rx, ry, rz = dx + 2 * facing * nx, dy + 2 * facing * ny, max(dz + 2 * facing * nz, 0.012)
-    length = math.sqrt(rx * rx + ry * ry + rz * rz)
-    rx, ry, rz = rx / length, ry / length, rz / length
+    fresnel = 0.02 + 0.98 * np.float32(1 - facing) ** np.float32(5 / steep) / (
+        1 + 22.7 * rough * math.sqrt(rough)
+    )
     haze = _clear_air(t)
     # light scattered back by the water itself, a little more of it through tilted faces
     body = (1 - fresnel) * (0.75 + 1.6 * max(sx * dx + sy * dy, -0.3)) * haze
@@ -283,68 +196,92 @@ def _mirror(
     image[pixel, 0] += body * 0.012 + (1 - haze) * s.horizon[0]
     image[pixel, 1] += body * 0.042 + (1 - haze) * s.horizon[1]
     image[pixel, 2] += body * 0.050 + (1 - haze) * s.horizon[2]
+    if not joins:
+        out.origin[k, 0], out.origin[k, 1], out.origin[k, 2] = x, y, rays.origin[i, 2] + t * dz + 0.02
+        out.direction[k, 0] = out.direction[k, 1] = out.direction[k, 2] = 0.0
+        out.pixel[k], out.width[k], out.travelled[k] = pixel, rays.width[i] + 0.6 * rough, width_m
+        out.share[k] = out.glint[k] = 0.0
+        k += 1
+    share = fresnel * haze
+    out.direction[k - 1, 0] += share * (dx + 2 * facing * nx)
+    out.direction[k - 1, 1] += share * (dy + 2 * facing * ny)
+    out.direction[k - 1, 2] += share * max(dz + 2 * facing * nz, 0.012)
+    out.share[k - 1] += share
+    out.glint[k - 1] += min(_glint(s, dx, dy, dz, sx, sy, lost) * share / facing, 6.0)
+    return k
+
+
+@inlined
+def _glint(s: Surfaces, dx: float, dy: float, dz: float, sx: float, sy: float, lost: float) -> float:
+    """Sunlight mirrored towards the eye by slopes too short to be seen, in units of `fresnel / facing`."""
     hx, hy, hz = s.sun[0] - dx, s.sun[1] - dy, s.sun[2] - dz
-    miss = (hx / hz + sx) ** 2 + (hy / hz + sy) ** 2
+    miss_x, miss_y = hx / hz + sx, hy / hz + sy
     variance = lost + 2e-4  # and the width of the sun itself
-    density = math.exp(-0.5 * miss / variance) / (2 * math.pi * variance) if miss < 60 * variance else 0.0
-    out.glint[k] = min(fresnel * SUN_IRRADIANCE * density / (4 * facing), 6.0) * haze
-    out.origin[k, 0], out.origin[k, 1], out.origin[k, 2] = x, y, rays.origin[i, 2] + t * dz + 0.02
-    out.direction[k, 0], out.direction[k, 1], out.direction[k, 2] = rx, ry, rz
-    out.pixel[k], out.share[k] = pixel, fresnel * haze
-    out.width[k], out.travelled[k] = rays.width[i] + 0.6 * rough, width_m
+    miss = (miss_x * miss_x + miss_y * miss_y) / variance
+    if miss > 60:
+        return 0.0
+    return SUN_IRRADIANCE / 4 * math.exp(-0.5 * miss) / (2 * math.pi * variance)
 
 
-@_loop
+@inlined
+def _settle(out: Mirrored, k: int) -> None:
+    """Gathered directions made unit; as far as they differ, the mirrored ray is wide."""
+    dx, dy, dz = out.direction[k, 0], out.direction[k, 1], out.direction[k, 2]
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    out.direction[k, 0], out.direction[k, 1], out.direction[k, 2] = dx / length, dy / length, dz / length
+    out.width[k] += math.sqrt(
+        12 * max(1 - length / out.share[k], 0.0)
+    )  # of even light with the same variance
+
+
+@loop
 def shade(s: Surfaces, water: Water, rays: Rays, out: Mirrored, image: Floats) -> int:
-    """Add each ray's colour to its pixel of `image` (P, 3); rays that meet water go on in `out`. Returns how many."""
-    k = 0
+    """Add each ray's colour to its pixel of `image` (P, 3); what pixels see in the water goes on in `out`. Returns
+    how many those are."""
+    s, water, rays, out = borrowed(s), borrowed(water), borrowed(rays), borrowed(out)
+    count, last = 0, -1
     for i in range(len(rays.pixel)):
         dx, dy, dz = rays.direction[i, 0], rays.direction[i, 1], rays.direction[i, 2]
-        triangle = rays.triangle[i]
-        t = rays.distance[i] if triangle >= 0 else np.inf
         ox, oy, oz = rays.origin[i, 0], rays.origin[i, 1], rays.origin[i, 2]
-        sea = water_distance(water, ox, oy, oz, dx, dy, dz, rays.width[i], t)
-        if sea < t and sea < _HORIZON_M:
-            _mirror(s, water, rays, i, sea, out, k, image)
-            k += 1
-            continue
+        hit = rays.cast[i]
+        triangle = rays.triangle[hit] if hit >= 0 else -1
+        t = rays.distance[hit] if triangle >= 0 else np.inf
+        if may_meet_water(water, oz, dz, t):
+            sea, sx, sy, octave = meet_water(water, ox, oy, oz, dx, dy, dz, rays.width[i], rays.rounding[i])
+            if sea < t and sea < HORIZON_M:
+                half = 2 * rays.pixel[i] + (1 if rays.rounding[i] > 0.5 else 0)
+                count = _mirror(s, water, rays, i, sea, sx, sy, octave, out, count, half == last, image)
+                last = half
+                continue
         if triangle < 0:
             r, g, b = _sky(s, dx, dy, dz)
             glare = dx * s.sun[0] + dy * s.sun[1] + dz * s.sun[2]
             if glare > 0.9994:
                 r, g, b = r + 8, g + 8, b + 7
         else:
-            n = s.normal[triangle]
-            cosine = abs(n[0] * dx + n[1] * dy + n[2] * dz)
-            r, g, b = _land(
-                s,
-                triangle,
-                rays.u[i],
-                rays.v[i],
-                ox + t * dx,
-                oy + t * dy,
-                oz + t * dz,
-                cosine,
-                rays.width[i] * t,
-            )
+            cosine = _cosine(s, triangle, dx, dy, dz)
+            x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+            width_m = rays.width[i] * t
+            r, g, b = _land(s, triangle, rays.u[hit], rays.v[hit], x, y, z, cosine, width_m, rays.rounding[i])
             haze = _clear_air(t)
-            r, g, b = (
-                r * haze + (1 - haze) * s.horizon[0],
-                g * haze + (1 - haze) * s.horizon[1],
-                b * haze + (1 - haze) * s.horizon[2],
-            )
+            r = r * haze + (1 - haze) * s.horizon[0]
+            g = g * haze + (1 - haze) * s.horizon[1]
+            b = b * haze + (1 - haze) * s.horizon[2]
         pixel = rays.pixel[i]
         image[pixel, 0] += r
         image[pixel, 1] += g
         image[pixel, 2] += b
-    return k
+    for k in range(count):
+        _settle(out, k)
+    return count
 
 
-@_loop
+@loop
 def shade_mirrored(
     s: Surfaces, rays: Mirrored, distance: Floats, triangles: Any, u: Floats, v: Floats, image: Floats
 ) -> None:
     """Add what mirrored rays see, by their share; the sun glints where nothing stands in the way."""
+    s, rays = borrowed(s), borrowed(rays)
     for i in range(len(triangles)):
         dx, dy, dz = rays.direction[i, 0], rays.direction[i, 1], rays.direction[i, 2]
         triangle, t = triangles[i], distance[i]
@@ -353,18 +290,17 @@ def shade_mirrored(
             r, g, b = _sky(s, dx, dy, dz)
             glint = rays.glint[i]
         else:
-            n = s.normal[triangle]
-            cosine = abs(n[0] * dx + n[1] * dy + n[2] * dz)
-            ox, oy, oz = rays.origin[i, 0], rays.origin[i, 1], rays.origin[i, 2]
+            cosine = _cosine(s, triangle, dx, dy, dz)
+            x, y, z = rays.origin[i, 0] + t * dx, rays.origin[i, 1] + t * dy, rays.origin[i, 2] + t * dz
             width_m = rays.travelled[i] + rays.width[i] * t
-            r, g, b = _land(s, triangle, u[i], v[i], ox + t * dx, oy + t * dy, oz + t * dz, cosine, width_m)
+            r, g, b = _land(s, triangle, u[i], v[i], x, y, z, cosine, width_m, 0.5)
         pixel, share = rays.pixel[i], rays.share[i]
         image[pixel, 0] += share * r + glint
         image[pixel, 1] += share * g + 0.93 * glint
         image[pixel, 2] += share * b + 0.8 * glint
 
 
-@_loop
+@loop
 def shade_hull(
     albedo: Floats, normal: Floats, sky_light: Floats, pixel: Any, sun: Array, image: Floats
 ) -> None:
@@ -376,51 +312,72 @@ def shade_hull(
         image[pixel[i], 2] += albedo[i, 2] * (sky_light[i, 2] + 0.8 * lit)
 
 
-@_loop
+@loop
 def surface_colours(s: Surfaces, triangles: Any, u: Floats, v: Floats, width_m: Floats, out: Floats) -> None:
     """Colours (N, 3) of points on triangles without any light."""
+    s = borrowed(s)
     for i in range(len(triangles)):
-        uv, w = s.uv[triangles[i]], 1 - u[i] - v[i]
-        tu = w * uv[0, 0] + u[i] * uv[1, 0] + v[i] * uv[2, 0]
-        tv = w * uv[0, 1] + u[i] * uv[1, 1] + v[i] * uv[2, 1]
-        r, g, b = _texture(s, s.texture[triangles[i]], tu, tv, width_m[i])
-        tint = s.tint[triangles[i]]
-        out[i, 0], out[i, 1], out[i, 2] = r * tint[0], g * tint[1], b * tint[2]
+        triangle, w = triangles[i], 1 - u[i] - v[i]
+        tu = w * s.uv[triangle, 0, 0] + u[i] * s.uv[triangle, 1, 0] + v[i] * s.uv[triangle, 2, 0]
+        tv = w * s.uv[triangle, 0, 1] + u[i] * s.uv[triangle, 1, 1] + v[i] * s.uv[triangle, 2, 1]
+        r, g, b = _texture(s, s.texture[triangle], tu, tv, math.log2(max(width_m[i], 1e-6)) + 0.5)
+        out[i, 0], out[i, 1] = r * s.tint[triangle, 0], g * s.tint[triangle, 1]
+        out[i, 2] = b * s.tint[triangle, 2]
 
 
-@_loop
+@loop
 def aim(
     cam_rays: Floats,
     row: Any,
     rotation: Array,
     centre: Array,
     depth_m: float,
-    origin: Floats,
-    direction: Floats,
-    reach: Floats,
-) -> None:
-    """World rays of camera rays (N, 3) in image rows (N,), each row with its own pose (H, 3, 3), (H, 3), and how
-    far they need to look: to `depth_m` below the still water."""
+    band: Array,
+    rays: tuple[Floats, Floats],
+    cast: Any,
+    thrown: tuple[Floats, Floats, Floats],
+) -> int:
+    """World rays (origins, directions) of camera rays (N, 3) in image rows (N,), each row with its own
+    `world_from_cam` (H, 3, 3), (H, 3).
+
+    Those that may meet scenery (inside `band`) are also thrown, with how far they need to look: to `depth_m` below
+    the still water. `cast`: (N,) their place among the thrown, or -1. Returns how many those are.
+    """
+    origin, direction = rays
+    thrown_origin, thrown_direction, reach = thrown
+    count = 0
     for i in range(len(row)):
-        R, c = rotation[row[i]], centre[row[i]]
-        for a in range(3):
-            direction[i, a] = R[a, 0] * cam_rays[i, 0] + R[a, 1] * cam_rays[i, 1] + R[a, 2] * cam_rays[i, 2]
-            origin[i, a] = c[a]
-        down = -direction[i, 2]
-        reach[i] = (c[2] + depth_m) / down + 0.1 if down > 1e-4 else 1e6
+        at = row[i]
+        x, y, z = cam_rays[i, 0], cam_rays[i, 1], cam_rays[i, 2]
+        dx = rotation[at, 0, 0] * x + rotation[at, 0, 1] * y + rotation[at, 0, 2] * z
+        dy = rotation[at, 1, 0] * x + rotation[at, 1, 1] * y + rotation[at, 1, 2] * z
+        dz = rotation[at, 2, 0] * x + rotation[at, 2, 1] * y + rotation[at, 2, 2] * z
+        direction[i, 0], direction[i, 1], direction[i, 2] = dx, dy, dz
+        cx, cy, cz = centre[at, 0], centre[at, 1], centre[at, 2]
+        origin[i, 0], origin[i, 1], origin[i, 2] = cx, cy, cz
+        cast[i] = -1
+        if in_band(band, dx, dy, dz):
+            cast[i] = count
+            thrown_direction[count, 0], thrown_direction[count, 1], thrown_direction[count, 2] = dx, dy, dz
+            thrown_origin[count, 0], thrown_origin[count, 1], thrown_origin[count, 2] = cx, cy, cz
+            reach[count] = (cz + depth_m) / -dz + 0.1 if dz < -1e-4 else 1e6
+            count += 1
+    return count
 
 
-@_loop
+@loop
 def classify(water: Water, rays: Rays, label: Any, ranges: Floats) -> None:
     """What each ray meets first, and how far away (inf: sky)."""
+    water, rays = borrowed(water), borrowed(rays)
     for i in range(len(rays.pixel)):
-        o, d = rays.origin[i], rays.direction[i]
-        t = rays.distance[i] if rays.triangle[i] >= 0 else np.inf
-        sea = water_distance(water, o[0], o[1], o[2], d[0], d[1], d[2], rays.width[i], t)
+        dx, dy, dz = rays.direction[i, 0], rays.direction[i, 1], rays.direction[i, 2]
+        ox, oy, oz = rays.origin[i, 0], rays.origin[i, 1], rays.origin[i, 2]
+        hit = rays.cast[i]
+        land = hit >= 0 and rays.triangle[hit] >= 0
+        t = rays.distance[hit] if land else np.inf
         pixel = rays.pixel[i]
-        if sea < t and sea < _HORIZON_M:
-            label[pixel], ranges[pixel] = WATER, sea
-        elif rays.triangle[i] >= 0:
-            label[pixel], ranges[pixel] = LAND, t
-        else:
-            label[pixel], ranges[pixel] = SKY, np.inf
+        label[pixel], ranges[pixel] = LAND if land else SKY, t
+        if may_meet_water(water, oz, dz, t):
+            sea, _, _, _ = meet_water(water, ox, oy, oz, dx, dy, dz, rays.width[i], 0.5)
+            if sea < t and sea < HORIZON_M:
+                label[pixel], ranges[pixel] = WATER, sea

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numba
 import numpy as np
@@ -35,11 +36,21 @@ class WaveTile:
     omega: Array
     amplitude: NDArray[np.complex128]
 
+    @cached_property
+    def _there_and_back(self) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """What turns with `exp(-i w t)` and with `exp(i w t)` in the spectrum of the (real) height, half plane."""
+        half = self.amplitude.shape[1] // 2 + 1
+        opposite = np.roll(self.amplitude[::-1, ::-1], 1, axis=(0, 1)).conj()
+        return self.amplitude[:, :half] / 2, opposite[:, :half] / 2
+
     def surface(self, time_s: float) -> NDArray[np.float32]:
         """(n, n, 3): height, slope by x and slope by y; row = y, column = x, cell (0, 0) at the origin."""
-        spectrum = self.amplitude * np.exp(-1j * self.omega * time_s)
-        stacked = np.stack([spectrum, 1j * self.kx * spectrum, 1j * self.ky * spectrum])
-        fields = scipy.fft.ifft2(stacked.astype(np.complex64), norm="forward").real
+        there, back = self._there_and_back
+        half = there.shape[1]
+        turned = np.exp(-1j * self.omega[:, :half] * time_s)
+        spectrum = there * turned + back * turned.conj()
+        stacked = np.stack([spectrum, 1j * self.kx[:, :half] * spectrum, 1j * self.ky[:, :half] * spectrum])
+        fields = scipy.fft.irfft2(stacked.astype(np.complex64), s=self.amplitude.shape, norm="forward")
         return np.ascontiguousarray(np.moveaxis(fields, 0, -1), dtype=np.float32)
 
 
