@@ -6,6 +6,8 @@ import runpy
 import shlex
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import typer
 import yaml
@@ -13,12 +15,15 @@ from typer.testing import CliRunner
 
 from calibrated_rigs import PINHOLE, boat, without_vertical
 from rigwake.calibration import load_calibration, save_calibration
+from rigwake.cameras.catalogue import camera_to_dict
 from rigwake.cli.main import build_app
 from rigwake.evaluate.calibrations import evaluate_calibration
 from rigwake.readers.truth import read_true_rig, rig_in_frame
 
 ROOT = Path(__file__).parent.parent
-EXAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.DOTALL)
+WHOLE_WAY, *EXAMPLES = re.findall(
+    r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.DOTALL
+)
 
 
 @pytest.mark.parametrize("code", EXAMPLES, ids=range(len(EXAMPLES)))
@@ -33,6 +38,27 @@ def test_examples_run(
 
 def test_there_are_three_examples() -> None:
     assert len(EXAMPLES) >= 3
+    assert "rigwake.calibrate(" in WHOLE_WAY
+
+
+def test_the_whole_way_says_what_a_recording_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    cameras = {}
+    for name in ("front", "left"):
+        folder = tmp_path / "harbour.bag" / name  # recordings are known by their content, not by their name
+        folder.mkdir(parents=True)
+        for k in range(4):
+            cv2.imwrite(
+                str(folder / f"{k}.png"), np.full((PINHOLE.height_px, PINHOLE.width_px), 100, np.uint8)
+            )
+        cameras[name] = {"camera": camera_to_dict(PINHOLE)}
+    (tmp_path / "harbour.bag" / "rig.yaml").write_text(yaml.safe_dump({"cameras": cameras}))
+    monkeypatch.chdir(tmp_path)
+    exec(compile(WHOLE_WAY, "docs/python.md", "exec"), {})
+    said = capsys.readouterr().out
+    assert "s of images are to be used." in said
+    assert "Record one to two minutes with turns to both sides." in said
 
 
 def test_a_notebook_shows_a_table_without_made_up_numbers() -> None:
@@ -166,6 +192,8 @@ def test_the_whole_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     commands[again] = ["diff", "OUT/calibration.yaml", "OUT/calibration.yaml"]
     said = run_commands(commands, monkeypatch)
     assert "Enough to calibrate." in said
+    exec(compile(WHOLE_WAY, "docs/python.md", "exec"), {})
+    assert set(load_calibration(Path("OUT3/calibration.yaml")).cameras) == {"front", "left"}
     truth = read_true_rig(tmp_path / "harbour_truth" / "truth.yaml")
     found = load_calibration(tmp_path / "OUT" / "calibration.yaml")
     for error in evaluate_calibration(found, rig_in_frame(truth, found.reference)).cameras.values():
