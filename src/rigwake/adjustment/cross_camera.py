@@ -41,9 +41,9 @@ def find_landmarks(
         for coefficients, here in _images(stream, searches.stamps[rows]):
             wanted = np.zeros(len(searches), dtype=bool)
             wanted[rows[here]] = True
-            pixels[wanted], std_px[wanted] = _look_around(
-                coefficients, references.take(wanted), shape, searches.take(wanted), options
-            )
+            own, patches = searches.take(wanted), references.take(wanted)
+            pixels[wanted], std_px[wanted] = _look_around(coefficients, patches, shape, own, options)
+            pixels[wanted] -= drawn_by_bend(patches, shape, own.warps, own.bends)
 
     _each_camera(problem, streams, look)
     agreed = np.flatnonzero(np.isfinite(std_px))
@@ -143,3 +143,23 @@ def _look_around(
 
 def _rings(options: HandOverOptions) -> int:
     return max(int(np.ceil(options.search_px / _REACH_PX - 0.5)), 0)
+
+
+def drawn_by_bend(references: References, shape: PatchShape, warps: Array, bends: Array) -> Array:
+    """(N, 2) how far patches are found from where they are, because their warp is bent and an affine one is fitted.
+
+    Perspective and lens move the sample at offset x from the patch's centre by `A x + b(x)`, b being quadratic with
+    the second derivatives `bends` (N, 2, 3). In the patch's own pixels that is `A^-1 b(x)`; with G the slopes of the
+    samples by position and warp, the fit answers with `(G^T G)^-1 G^T g`, g what `A^-1 b` does to the samples.
+    A tenth of a pixel between cameras that look 90 degrees apart, in the same sense for all of them.
+    """
+    x, y = shape.offsets.T.astype(np.float64)
+    quadratic = np.stack([x * x / 2, x * y, y * y / 2])
+    moved = np.linalg.inv(warps) @ bends @ quadratic
+    n_unknowns = references.information.shape[1]
+    slopes = references.pattern[:, :n_unknowns].astype(np.float64)
+    changed = np.einsum("nik,nik->nk", slopes[:, :2], moved)
+    right = np.einsum("nik,nk->ni", slopes, changed)
+    ridge = 1e-9 * np.einsum("nii->n", references.information)[:, None, None] * np.eye(n_unknowns)
+    fitted = np.linalg.solve(references.information + ridge, right[:, :, None])
+    return np.asarray((warps @ fitted[:, :2])[:, :, 0])

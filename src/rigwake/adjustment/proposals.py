@@ -20,9 +20,10 @@ from rigwake.geometry.interpolate import interpolate
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
 from rigwake.tracking.masks import inside
-from rigwake.tracking.warps import stencil_bearings
 
 Indices = NDArray[np.int64]
+_STENCIL_PX = 2.0
+_STENCIL = _STENCIL_PX * np.array([[x, y] for y in (-1, 0, 1) for x in (-1, 0, 1)])  # row by row
 _PAIRS_AT_ONCE = 1_000_000  # of images and landmarks, to bound memory
 _NEAR = 1e-3  # 1 / metres: what lies further away says nothing about where cameras are
 
@@ -61,7 +62,7 @@ class Searches:
 
     landmarks: (S,). source_cameras, source_stamps, source_pixels, source_std_px: the observation whose patch is
     looked for. cameras, stamps: the image to look in. pixels: (S, 2) prediction. warps: (S, 2, 2) predicted
-    `d pixel / d source pixel`.
+    `d pixel / d source pixel`. bends: (S, 2, 3) its second derivatives, by xx, xy and yy.
     """
 
     landmarks: Indices
@@ -73,6 +74,7 @@ class Searches:
     stamps: Indices
     pixels: Array
     warps: Array
+    bends: Array
 
     def __len__(self) -> int:
         return len(self.landmarks)
@@ -171,6 +173,7 @@ def _of_camera(
         stamps[image[chosen]],
         pixels[chosen],
         np.tile(np.eye(2), (len(chosen), 1, 1)),
+        np.zeros((len(chosen), 2, 3)),
     )
 
 
@@ -266,35 +269,43 @@ def _spread(landmarks: Indices, image: Indices, most: int) -> Indices:
 
 
 def _with_warps(problem: RigProblem, searches: Searches, options: HandOverOptions) -> Searches:
-    """Warps of patches that lie in the plane through the landmark facing halfway between both viewers."""
-    points = problem.landmarks.points_world[searches.landmarks]
-    warps, good = np.empty((len(searches), 2, 2)), np.zeros(len(searches), dtype=bool)
+    """Warps and bends of patches that lie in the plane through the landmark facing halfway between both viewers."""
+    mapped = np.full((len(searches), 9, 2), np.nan)
     for source in range(len(problem.cameras)):
         for target in range(len(problem.cameras)):
             rows = np.flatnonzero((searches.source_cameras == source) & (searches.cameras == target))
-            if not len(rows):
-                continue
-            world_from_source = camera_from_world(problem, source, searches.source_stamps[rows]).inverse()
-            target_from_world = camera_from_world(problem, target, searches.stamps[rows])
-            stencil, valid = stencil_bearings(problem.cameras[source].model, searches.source_pixels[rows])
-            rays = np.einsum("nij,nkj->nki", world_from_source.rotation, stencil)
-            to_source = _unit(world_from_source.translation - points[rows])
-            to_target = _unit(target_from_world.inverse().translation - points[rows])
-            normal = _unit(to_source + to_target)
-            depth = np.einsum("ni,ni->n", normal, points[rows] - world_from_source.translation)
-            slope = np.einsum("ni,nki->nk", normal, rays)
-            corners = world_from_source.translation[:, None] + rays * (depth[:, None] / slope)[:, :, None]
-            corners_cam = (
-                np.einsum("nij,nkj->nki", target_from_world.rotation, corners)
-                + target_from_world.translation[:, None]
-            )
-            pixels, seen = problem.cameras[target].model.project(corners_cam.reshape(-1, 3))
-            right, left, below, above = pixels.reshape(-1, 4, 2).transpose(1, 0, 2)
-            warps[rows] = np.stack([right - left, below - above], axis=2) / 4.0
-            good[rows] = valid & seen.reshape(-1, 4).all(axis=1)
+            if len(rows):
+                mapped[rows] = _mapped(problem, searches.take(rows), source, target)
+    grid = mapped.reshape(-1, 3, 3, 2)
+    left, right, above, below = grid[:, 1, 0], grid[:, 1, 2], grid[:, 0, 1], grid[:, 2, 1]
+    twice_centre = 2 * grid[:, 1, 1]
+    warps = np.stack([right - left, below - above], axis=2) / (2 * _STENCIL_PX)
+    twisted = (grid[:, 2, 2] + grid[:, 0, 0] - grid[:, 2, 0] - grid[:, 0, 2]) / 4
+    curved = np.stack([right + left - twice_centre, twisted, below + above - twice_centre], axis=2)
+    good = np.isfinite(mapped).all(axis=(1, 2))
     stretch = np.sqrt(np.abs(np.linalg.det(np.where(good[:, None, None], warps, np.eye(2)))))
     good &= (stretch < options.max_stretch) & (stretch > 1 / options.max_stretch)
-    return replace(searches, warps=warps).take(np.flatnonzero(good))
+    return replace(searches, warps=warps, bends=curved / _STENCIL_PX**2).take(np.flatnonzero(good))
+
+
+def _mapped(problem: RigProblem, searches: Searches, source: int, target: int) -> Array:
+    """(S, 9, 2) where the 3 x 3 stencils about the source pixels come to lie in the target's images; NaN outside."""
+    points = problem.landmarks.points_world[searches.landmarks]
+    world_from_source = camera_from_world(problem, source, searches.source_stamps).inverse()
+    target_from_world = camera_from_world(problem, target, searches.stamps)
+    stencil = (searches.source_pixels[:, None] + _STENCIL).reshape(-1, 2)
+    bearings, _ = problem.cameras[source].model.unproject(stencil)
+    rays = np.einsum("nij,nkj->nki", world_from_source.rotation, bearings.reshape(-1, 9, 3))
+    to_source = _unit(world_from_source.translation - points)
+    to_target = _unit(target_from_world.inverse().translation - points)
+    normal = _unit(to_source + to_target)
+    depth = np.einsum("ni,ni->n", normal, points - world_from_source.translation)
+    slope = np.einsum("ni,nki->nk", normal, rays)
+    corners = world_from_source.translation[:, None] + rays * (depth[:, None] / slope)[:, :, None]
+    corners_cam = np.einsum("nij,nkj->nki", target_from_world.rotation, corners)
+    corners_cam += target_from_world.translation[:, None]
+    pixels, _ = problem.cameras[target].model.project(corners_cam.reshape(-1, 3))
+    return pixels.reshape(-1, 9, 2)
 
 
 def _unit(vectors: Array) -> Array:
