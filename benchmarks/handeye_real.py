@@ -14,7 +14,7 @@ import gzip
 import os
 import sys
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 
 import cv2
@@ -23,6 +23,8 @@ import numpy as np
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
 from rigwake.handeye.calibrate import calibrate_handeye
+from rigwake.handeye.closed_forms import park_martin
+from rigwake.handeye.resample import Curve
 from rigwake.handeye.values import HandeyeOptions
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.trajectory import Trajectory
@@ -71,6 +73,30 @@ def pairwise_loop(trajectories: dict[str, Trajectory]) -> tuple[float, float, fl
         loop = loop * result.ref_from_members[b]
         clock += result.members[b].time_offset_s or 0.0
     return *degrees_and_mm(loop), 1e3 * clock
+
+
+def naive_loops(trajectories: dict[str, Trajectory], stride: int) -> dict[str, tuple[float, float]]:
+    """Degrees and millimetres of the loop by a closed form on motions over `stride` poses.
+
+    Its translation takes the lever `I - R_A` from the rotations of one side; the key names whose, pair by pair.
+    """
+    found: dict[tuple[str, str], dict[str, SE3]] = {}
+    names = list(trajectories)
+    for a, b in zip(names, names[1:] + names[:1], strict=True):
+        offset = calibrate_handeye(trajectories[a], [trajectories[b]]).members[b].time_offset_s or 0.0
+        first, second = Curve.of(trajectories[a]), Curve.of(trajectories[b])
+        there = first.times_s + (first.start_ns - second.start_ns) * 1e-9 - offset
+        inside = (there >= 0) & (there <= second.times_s[-1])
+        poses = [first.world_from_body[inside], second.at(there[inside]).world_from_body]
+        A, B = (x[:-stride].inverse() * x[stride:] for x in poses)
+        found[a, b] = {a: park_martin(A, B), b: park_martin(B, A).inverse()}
+    loops = {}
+    for whose in product(*found.values()):
+        loop = SE3.identity()
+        for solutions, name in zip(found.values(), whose, strict=True):
+            loop = loop * solutions[name]
+        loops[", ".join(whose)] = degrees_and_mm(loop)
+    return loops
 
 
 def halves(reference: Trajectory) -> tuple[Trajectory, Trajectory]:
@@ -184,6 +210,10 @@ def main() -> None:
         f"| tango_triplet: three pairwise results around the loop | {turn:.4f} deg, {shift:.2f} mm, "
         f"{clock:+.2f} ms | 0 |"
     )
+    for whose, (turn, shift) in naive_loops(devices, 25).items():
+        print(
+            f"| Park-Martin over 25 poses, levers by the rotations of {whose} | {turn:.4f} deg, {shift:.2f} mm | 0 |"
+        )
     names = list(devices)
     joint = calibrate_handeye(devices[names[0]], [devices[n] for n in names[1:]])
     a, b = (joint.ref_from_members[n] for n in names[1:])

@@ -83,12 +83,8 @@ def learnt_noise(
         # an error of the reference's rotation moves the member by the lever arm
         arm = hat(X.inverse().translation)
         moved = _robust_covariance(r[:, 3:], by_axis) - arm @ turned @ arm.T / 2
-        if not by_axis:
-            moved = np.trace(moved) / 3 * np.eye(3)
-        values, vectors = np.linalg.eigh(moved)
-        kept = np.maximum(values, 0.05 * max(values[-1], 0.0) + TRANSLATION_FLOOR**2)
         rotation.append(turned)
-        translation.append((vectors * kept) @ vectors.T)
+        translation.append(_positive(moved) if by_axis else _positive_level(moved) * np.eye(3))
     members = [np.zeros((1, 6, 6)) for _ in range(count)]
     reference = np.zeros((1, 6, 6))
     for first, found in ((0, rotation), (3, translation)):
@@ -98,6 +94,18 @@ def learnt_noise(
             members[m][0, block, block] = (1 - shares[m]) * found[m]
             reference[0, block, block] += shares[m] / count * (X.rotation @ found[m] @ X.rotation.T)
     return known_noise(mountings, reference, members)
+
+
+def _positive_level(covariance: Array) -> float:
+    """Mean variance of (3, 3), not below what rounding allows."""
+    return max(float(np.trace(covariance)) / 3, 0.0) + TRANSLATION_FLOOR**2
+
+
+def _positive(covariance: Array) -> Array:
+    """(3, 3) with no direction below a twentieth of the widest."""
+    values, vectors = np.linalg.eigh(covariance)
+    kept = np.maximum(values, 0.05 * max(values[-1], 0.0) + TRANSLATION_FLOOR**2)
+    return np.asarray((vectors * kept) @ vectors.T)
 
 
 def _shares_of_reference(

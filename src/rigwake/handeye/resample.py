@@ -98,15 +98,15 @@ class Curve:
         Times within a nanosecond of a pose are that pose.
         """
         times, n = self.times_s, len(self.times_s)
-        nearest = np.clip(np.searchsorted(times, times_s - 1e-9), 0, n - 1)
+        nearest = np.minimum(np.searchsorted(times, times_s - 1e-9), n - 1)
         at_node = np.abs(times[nearest] - times_s) <= 1e-9
         segment_ids = self.trajectory.segment_ids
         assert segment_ids is not None
         if at_node.all():
             return Sampled(self.world_from_body[nearest], self.twists[nearest], segment_ids[nearest])
-        left = np.where(at_node, np.minimum(nearest, n - 2), np.clip(nearest - 1, 0, n - 2))
+        left = np.where(at_node, np.minimum(nearest, n - 2), np.minimum(np.maximum(nearest - 1, 0), n - 2))
         span = times[left + 1] - times[left]
-        alpha = np.clip((times_s - times[left]) / span, -0.1, 1.1)
+        alpha = np.minimum(np.maximum((times_s - times[left]) / span, -0.1), 1.1)
         alpha = np.where(at_node, (nearest > left) * 1.0, alpha)
         poses = self.world_from_body
         rotation, translation, twists = kernels.interpolate(
