@@ -47,6 +47,9 @@ def command(
     assignments: Annotated[
         list[str] | None, typer.Option("--set", help="One setting: adjustment.cross_camera=false.")
     ] = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the result in the rerun viewer (extra `rerun`).")
+    ] = False,
     print_config: Annotated[bool, typer.Option("--print-config", help="Show all settings and stop.")] = False,
     topic: TopicOption = (),
     topics: TopicsOption = None,
@@ -95,6 +98,11 @@ def command(
         write_json(json_file, calibration_to_dict(run.calibration))
     if str(json_file) != "-":
         _print_run(run)
+    if view:
+        from rigwake.report.content import load_report_content
+        from rigwake.report.rerun_log import log_to_rerun
+
+        log_to_rerun(load_report_content(run.out), None, view)
 
 
 def _print_run(run: CalibrationRun) -> None:
