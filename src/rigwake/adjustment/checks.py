@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from rigwake.adjustment.gauge import with_gauge
 from rigwake.adjustment.proposals import predicted_pixels
@@ -80,17 +82,23 @@ def split_half(
     problem: RigProblem, reference: ReferenceFrame, options: AdjustmentOptions
 ) -> tuple[Calibration, Calibration] | str:
     """The rig from either half of the recording alone; or, in words, why a half does not determine it."""
-    middle = len(problem.states) // 2
-    halves = []
-    for first, last in ((0, middle), (middle, len(problem.states))):
+
+    def half(first: int, last: int) -> Calibration | str:
         try:
             part = part_of(problem, first, last, options.min_observations)
             solution = solve(part, SETTLED)
             covariance = covariance_of(solution.problem, clustered=True)
-            halves.append(calibrated_cameras(solution, covariance, reference, {}, {}))
+            return calibrated_cameras(solution, covariance, reference, {}, {})
         except RigwakeError as error:
             return str(error)
-    return halves[0], halves[1]
+
+    middle = len(problem.states) // 2
+    # the limit is that of the process: set before both, so that neither lifts it while the other works
+    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(2) as pool:
+        earlier, later = pool.map(half, (0, middle), (middle, len(problem.states)))
+    if isinstance(earlier, str):
+        return earlier
+    return later if isinstance(later, str) else (earlier, later)
 
 
 def split_half_summary(halves: tuple[Calibration, Calibration] | str) -> dict[str, Any]:
