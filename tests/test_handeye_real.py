@@ -18,8 +18,8 @@ def devices(real_recordings):
 
 def test_three_pairwise_results_close_the_loop(devices):
     degrees, millimetres, clock_ms = BENCHMARK["pairwise_loop"](devices)
-    assert degrees < 0.015
-    # the devices disagree by 1 to 2 % about the rate of turning: over arms of 0.5 to 1.4 m that leaves some mm
+    assert degrees <= 0.015
+    # one device's rate of turning is up to 1.3 % off: over arms of 0.5 to 1.4 m that leaves some mm
     assert millimetres < 4.0
     assert abs(clock_ms) < 1.0
 
