@@ -28,7 +28,7 @@ class HandeyeOptions:
 
     method: `ml`, or the baseline `seed`.
     noise: errors independent from increment to increment, from pose to pose, or `estimated`: drift and jitter
-        in shares learnt from the residuals, or poses where these explain the residuals better (BIC).
+        in shares learnt from the residuals, or poses where these do not drift (see `selection`).
         None: as the covariances of the trajectories say, else `estimated`.
     levels: known noise by trajectory name, for trajectories that bring no covariances of their own. Unless
         every trajectory has covariances or a level, the noise is estimated from the residuals.
