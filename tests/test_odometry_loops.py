@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from odometry_worlds import circling, fisheye, tracks_of
-from rigwake.odometry.loop_closure import LoopOptions, find_loops, joined_tracks
-from rigwake.odometry.monocular import estimate_monocular
+from rigwake.evaluate.trajectories import absolute_error
+from rigwake.odometry.loop_closure import LoopOptions, closed_path, find_loops, joined_tracks
+from rigwake.odometry.monocular import estimate_monocular, readjust
 from rigwake.odometry.result import OdometryResult
 from rigwake.recording import CameraStream, Frame
 from rigwake.tracks import Tracks
+from rigwake.trajectory import Trajectory
 
 FRAMES = 60
 
@@ -60,6 +62,28 @@ def test_an_outage_is_bridged_by_recognising_the_place(broken):
     after = estimate_monocular(joined_tracks(tracks, loops.track_ids), camera)
     assert after.counts.segments == 1
     assert after.counts.placed == before.counts.placed
+
+
+def test_a_loop_joins_segments_of_different_units_and_takes_their_drift_away():
+    path = circling(160, seconds_per_turn=13.0)  # a turn and a quarter; tracks live for a second and a half
+    tracks = tracks_of(path, fisheye(), points=200, longest=15, noise_px=0.5)
+    drawn = StampedDots(tracks, tracks.track_ids // 10_000)
+    stream = CameraStream("front", tracks.timestamps_ns, drawn, 640, 480, fisheye())
+    before = estimate_monocular(tracks, fisheye())
+    loops = find_loops(stream, tracks, fisheye(), before, LoopOptions(min_gap_s=9.0, words=32))
+    frames, closed = closed_path(before, loops)
+    np.testing.assert_array_equal(frames, before.frame_indices)
+    after = readjust(joined_tracks(tracks, loops.track_ids), fisheye(), frames, closed)
+
+    def error(found: Trajectory) -> float:
+        truth = Trajectory("truth", tracks.timestamps_ns, path)
+        return absolute_error(truth, found, alignment="sim3").rmse_m
+
+    by_graph = error(replace(before.trajectory, world_from_body=closed, covariances=None))
+    assert by_graph < 0.05 * error(before.trajectory)
+    assert error(after.trajectory) < by_graph
+    assert after.counts.segments == 1
+    assert len(after.trajectory) >= len(frames)
 
 
 def test_joined_tracks_keep_one_observation_per_frame():

@@ -10,10 +10,10 @@ from typing import Literal
 from rigwake.cameras.base import CameraModel
 from rigwake.errors import EstimationError, UnobservableError, UsageError
 from rigwake.geometry.so3 import Array
-from rigwake.odometry.loop_closure import find_loops, joined_tracks
+from rigwake.odometry.loop_closure import closed_path, find_loops, joined_tracks
 from rigwake.odometry.measure import Progress, measure_camera
 from rigwake.odometry.metric import MetricStart, metric_start
-from rigwake.odometry.monocular import estimate_monocular
+from rigwake.odometry.monocular import estimate_monocular, readjust
 from rigwake.odometry.options import OdometryOptions
 from rigwake.odometry.result import OdometryResult
 from rigwake.odometry.seed import SeedOptions, estimate_seed
@@ -173,16 +173,18 @@ class _Run:
 
     def _visual(self, tracks: Tracks, rotations: Array | None) -> OdometryResult:
         total = len(tracks.timestamps_ns)
-        alone = self.imu is None and self.gnss is None  # else the smoother adjusts all frames anyway
         return estimate_monocular(
             tracks,
             self.model,
-            replace(
-                self.options.odometry, adjust_all_frames=alone and self.options.odometry.adjust_all_frames
-            ),
+            self._options(),
             rotations=rotations,
             progress=lambda done: self.progress("odometry", min(done, total), total),
         )
+
+    def _options(self) -> OdometryOptions:
+        alone = self.imu is None and self.gnss is None  # else the smoother adjusts all frames anyway
+        chosen = self.options.odometry
+        return replace(chosen, adjust_all_frames=alone and chosen.adjust_all_frames)
 
     def _first_visual(
         self, tracks: Tracks, rotations: Array | None
@@ -206,13 +208,21 @@ class _Run:
     def _closed(
         self, tracks: Tracks, visual: OdometryResult, rotations: Array | None
     ) -> tuple[Tracks, OdometryResult]:
-        """Once more with the tracks of recognised places joined, if there are any."""
+        """Tracks of recognised places joined, the path closed and adjusted again; as they were without such places."""
         self.progress("recognising places", 0, 1)
         loops = find_loops(self.stream, tracks, self.model, visual)
         if not len(loops.frames):
             return tracks, visual
         joined = joined_tracks(tracks, loops.track_ids)
-        again = self._visual(joined, rotations)
+        try:
+            frames, path = closed_path(visual, loops)
+        except EstimationError as error:
+            self.notes.append(error.cause)
+            frames, path = visual.frame_indices[:0], visual.trajectory.world_from_body[:0]
+        if len(frames) == len(visual.frame_indices):
+            again = readjust(joined, self.model, frames, path, self._options())
+        else:  # what the loops do not connect may be found again on the joined tracks
+            again = self._visual(joined, rotations)
         self.notes.append(
             f"{len(loops.frames)} pairs of frames show a place again: {visual.counts.segments} segments became "
             f"{again.counts.segments}"

@@ -2,8 +2,8 @@
 
 A vocabulary of binary descriptors is learnt from the recording itself; frames with similar word histograms are
 compared descriptor by descriptor, and a pair counts if one pose explains its matches (PnP on the map's points). What
-belongs together gets one track number. Odometry run again on such tracks stays in one segment across an outage
-(relocalisation) and its adjustment closes loops.
+belongs together gets one track number. A pose graph in Sim(3) spreads the error of the loop over the path
+(`closed_path`); adjusted again from there, the joined tracks agree.
 
 Sources: Sivic and Zisserman, *Video Google* (2003); Galvez-Lopez and Tardos, *Bags of binary words* (2012).
 """
@@ -19,13 +19,18 @@ from numpy.typing import NDArray
 from rigwake.cameras.base import CameraModel
 from rigwake.errors import EstimationError
 from rigwake.geometry.pnp import absolute_pose
+from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
 from rigwake.odometry.observations import radians_per_pixel
+from rigwake.odometry.pose_graph import Edges, Similarities, optimise_pose_graph
 from rigwake.odometry.result import OdometryResult
 from rigwake.recording import CameraStream
 from rigwake.tracks import Tracks
 
 Indices = NDArray[np.int64]
+# what odometry may be wrong by from frame to frame, and a recognised place: rotation, share of length, log of scale
+_STEP_STD = (1e-3, 0.01, 3e-3)
+_LOOP_STD = (2e-3, 2e-3, 0.02)
 
 
 @dataclass(frozen=True)
@@ -50,10 +55,15 @@ class LoopOptions:
 
 @dataclass(frozen=True, eq=False)
 class Loops:
-    """Pairs of frames that show the same place, (P, 2), and pairs of track ids that are the same point, (K, 2)."""
+    """Pairs of frames that show the same place, (P, 2), and pairs of track ids that are the same point, (K, 2).
+
+    world_from_second: (P,) where each pair's second frame is by the points that the first one knew, with the unit
+    of length that the map has around the second, in units of the map around the first.
+    """
 
     frames: Indices
     track_ids: Indices
+    world_from_second: Similarities
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +85,7 @@ def find_loops(
     options = options or LoopOptions()
     frames = _spaced(tracks, visual, options.interval_s)
     described = _describe(stream, tracks, visual, frames)
-    none = Loops(np.empty((0, 2), np.int64), np.empty((0, 2), np.int64))
+    none = Loops(np.empty((0, 2), np.int64), np.empty((0, 2), np.int64), Similarities.exp(np.empty((0, 7))))
     if len(described.rows) < options.words:
         return none
     frame_of = tracks.frame_indices[described.rows]
@@ -84,7 +94,7 @@ def find_loops(
     far = np.abs(stamps[:, None] - stamps[None]) >= options.min_gap_s * 1e9
     rng = np.random.default_rng(options.seed)
     points = dict(zip(visual.landmarks.track_ids.tolist(), visual.landmarks.points_world, strict=True))
-    pairs, same = [], []
+    pairs, same, placed = [], [], []
     for i, frame in enumerate(frames):
         earlier = np.flatnonzero(far[i] & (np.arange(len(frames)) < i))
         for j in earlier[np.argsort(-similarity[i, earlier], kind="stable")[: options.candidates]]:
@@ -92,10 +102,76 @@ def find_loops(
             new, old = (described.descriptors[frame_of == f] for f in (frame, frames[j]))
             a, b = _matches(new, old, options)
             found = _verified(tracks, camera, points, rows_new[a], rows_old[b], options, rng)
-            if len(found):
+            if found is not None:
+                ids, world_from_cam = found
                 pairs.append((int(frames[j]), int(frame)))
-                same.append(found)
-    return Loops(np.array(pairs, dtype=np.int64), np.concatenate(same)) if pairs else none
+                same.append(ids)
+                placed.append((world_from_cam, _unit(visual, points, int(frame), ids, world_from_cam)))
+    if not pairs:
+        return none
+    transforms, units = zip(*placed, strict=True)
+    world_from_second = Similarities(
+        np.stack([t.rotation for t in transforms]),
+        np.stack([t.translation for t in transforms]),
+        np.array(units),
+    )
+    return Loops(np.array(pairs, dtype=np.int64), np.concatenate(same), world_from_second)
+
+
+def _unit(
+    visual: OdometryResult, points: dict[int, Array], frame: int, ids: Indices, world_from_cam: SE3
+) -> float:
+    """How many units of the old points' map the new points' unit is: the median ratio of ranges from the frame."""
+    centre = visual.trajectory.world_from_body.translation[np.searchsorted(visual.frame_indices, frame)]
+    ratios = [
+        np.linalg.norm(points[old] - world_from_cam.translation) / np.linalg.norm(points[new] - centre)
+        for old, new in ids.tolist()
+        if new in points
+    ]
+    return float(np.median(ratios)) if ratios else 1.0
+
+
+def closed_path(visual: OdometryResult, loops: Loops) -> tuple[Indices, SE3]:
+    """Frames and their `world_from_cam` after a pose graph in Sim(3) has spread what the loops reveal over the path.
+
+    Segments that loops connect share one world; frames of others are left out. Raises EstimationError if the graph
+    does not converge.
+    """
+    path = visual.trajectory.world_from_body
+    segments = visual.trajectory.segment_ids
+    assert segments is not None
+    nodes = Similarities.from_transforms(path)
+    before = np.flatnonzero(np.diff(segments) == 0)
+    own = nodes[before].inverse() * nodes[before + 1]
+    first, second = np.searchsorted(visual.frame_indices, loops.frames).T
+    seen = nodes[first].inverse() * loops.world_from_second
+    step = np.linalg.norm(own.translation, axis=1)
+    step = np.maximum(step, np.median(step))
+    ranges = np.linalg.norm(visual.landmarks.points_world - path.translation.mean(axis=0), axis=1)
+    std = np.concatenate(
+        [_edge_std(_STEP_STD, step), _edge_std(_LOOP_STD, np.full(len(first), np.median(ranges)))]
+    )
+    measured = [
+        np.concatenate([getattr(own, name), getattr(seen, name)])
+        for name in ("rotation", "translation", "scale")
+    ]
+    edges = Edges(
+        np.concatenate([before, first]),
+        np.concatenate([before + 1, second]),
+        Similarities(*measured),
+        std,
+        np.repeat([False, True], [len(before), len(first)]),
+    )
+    closed, member = optimise_pose_graph(nodes, edges)
+    return visual.frame_indices[member], SE3(closed.rotation[member], closed.translation[member])
+
+
+def _edge_std(relative: tuple[float, float, float], lengths: Array) -> Array:
+    """(E, 7) of edges: radians, a share of the length, and the log of scale."""
+    rotation, translation, scale = relative
+    columns = np.repeat([rotation, 0.0, scale], [3, 3, 1]) * np.ones((len(lengths), 1))
+    columns[:, 3:6] = translation * lengths[:, None]
+    return columns
 
 
 def _spaced(tracks: Tracks, visual: OdometryResult, interval_s: float) -> Indices:
@@ -168,12 +244,13 @@ def _verified(
     rows_old: Indices,
     options: LoopOptions,
     rng: np.random.Generator,
-) -> Indices:
-    """(K, 2) ids of tracks (old, new) that are one point: PnP of the new view on the old tracks' points agrees."""
+) -> tuple[Indices, SE3] | None:
+    """(K, 2) ids of tracks (old, new) that are one point, and the new view's place: PnP on the old tracks' points
+    agrees with them."""
     ids_old, ids_new = tracks.track_ids[rows_old], tracks.track_ids[rows_new]
     usable = np.array([int(i) in points for i in ids_old], dtype=bool) & (ids_old != ids_new)
     if usable.sum() < options.min_matches:
-        return np.empty((0, 2), np.int64)
+        return None
     ids_old, ids_new, bearings = ids_old[usable], ids_new[usable], tracks.bearings_cam[rows_new[usable]]
     world = np.stack([points[int(i)] for i in ids_old])
     rad_per_px = radians_per_pixel(camera, bearings)
@@ -182,10 +259,10 @@ def _verified(
             world, bearings, max_angles=options.gate_px * rad_per_px, angle_stds=0.5 * rad_per_px, rng=rng
         )
     except EstimationError:
-        return np.empty((0, 2), np.int64)
+        return None
     if pose.inliers.sum() < options.min_matches:
-        return np.empty((0, 2), np.int64)
-    return np.stack([ids_old[pose.inliers], ids_new[pose.inliers]], axis=1)
+        return None
+    return np.stack([ids_old[pose.inliers], ids_new[pose.inliers]], axis=1), pose.world_from_cam
 
 
 def joined_tracks(tracks: Tracks, same_ids: Indices) -> Tracks:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from rigwake.trajectory import Trajectory
 Indices = NDArray[np.int64]
 Progress = Callable[[int], None]
 _MIN_SEGMENT = 5  # frames
+_WIDE = 4.0  # times the gate, where poses are only nearly right
 
 
 def estimate_monocular(
@@ -52,6 +54,34 @@ def estimate_monocular(
     failure = builder.build()
     if not (builder.map.segment >= 0).any():
         raise failure or EstimationError(f"{tracks.camera}: there are no frames.")
+    return builder.result(time.perf_counter() - started)
+
+
+def readjust(
+    tracks: Tracks,
+    camera: CameraModel,
+    frame_indices: Indices,
+    world_from_cam: SE3,
+    options: OdometryOptions | None = None,
+) -> OdometryResult:
+    """The map and the path of these frames from poses that are nearly right, such as those of a closed loop.
+
+    Points are triangulated from the given poses, first with a wide gate, and all is adjusted in one segment.
+    """
+    options = options or OdometryOptions()
+    started = time.perf_counter()
+    wide = replace(options, gate_px=_WIDE * options.gate_px)
+    builder = _Builder(VisualMap(index_observations(tracks, camera), wide), camera, None, None)
+    for k, frame in enumerate(frame_indices.tolist()):
+        builder.map.place(frame, world_from_cam[k], 0)
+    interval = max(round(0.5 * options.keyframe_interval_s * 1e9), 1)
+    stamps = tracks.timestamps_ns[frame_indices]
+    _, spaced = np.unique((stamps - stamps[0]) // interval, return_index=True)
+    builder.map.keyframe[frame_indices[spaced]] = True
+    builder.segments = 1
+    builder.finish(0)
+    builder.map.options = options
+    builder.finish(0)
     return builder.result(time.perf_counter() - started)
 
 
@@ -99,7 +129,7 @@ class _Builder:
         adjust_all(self.map, self.camera, segment, keyframes_only=True)
         self._grow(range(pair.second + 1, last + 1), segment, pair.second)
         self._grow(range(pair.first - 1, first - 1, -1), segment, pair.first)
-        self._finish(segment)
+        self.finish(segment)
         placed = np.flatnonzero(self.map.segment == segment)
         return int(placed[0]), int(placed[-1])
 
@@ -131,7 +161,7 @@ class _Builder:
         else:
             adjust_window(self.map, self.camera, segment, newest)
 
-    def _finish(self, segment: int) -> None:
+    def finish(self, segment: int) -> None:
         """Adjust keyframes, place every frame anew, then (if wanted) adjust all frames together."""
         self._triangulate_all(segment, keyframes_only=True)
         adjust_all(self.map, self.camera, segment, keyframes_only=True)
