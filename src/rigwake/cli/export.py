@@ -27,7 +27,10 @@ def command(
     ] = None,
     parent_frame: Annotated[str, typer.Option(help="ROS, URDF: the parent frame; default the rig's.")] = "",
     child_frame: Annotated[
-        str, typer.Option(help="ROS, URDF: the cameras' frames.")
+        str,
+        typer.Option(
+            help="ROS, URDF: the cameras' frames; default {name}_optical_frame.", show_default=False
+        ),
     ] = "{name}_optical_frame",
     imu: Annotated[
         Path | None, typer.Option(help="Kalibr's imu.yaml, for formats that hold IMU noise (basalt).")
@@ -36,7 +39,11 @@ def command(
         float, typer.Option(help="Largest error, in pixels, of a lens that has to be converted.")
     ] = 0.5,
     allow_undetermined: Annotated[
-        bool, typer.Option(help="Leave cameras out that are not fully determined, instead of refusing.")
+        bool,
+        typer.Option(
+            "--allow-undetermined",
+            help="Leave cameras out that are not fully determined, instead of refusing.",
+        ),
     ] = False,
 ) -> None:
     """Write a calibration so that ROS, Kalibr, OpenVINS, Basalt, COLMAP, mrcal, OpenCV or CamOdoCal load it.

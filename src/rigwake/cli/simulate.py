@@ -32,7 +32,9 @@ def command(
         int | None, typer.Option(help="Another draw of sea, noise and (unless fixed) scene.")
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Frames rendered at a time.")] = os.cpu_count() or 1,
-    truth_images: Annotated[bool, typer.Option(help="Also label and range images of every frame.")] = False,
+    truth_images: Annotated[
+        bool, typer.Option("--truth-images", help="Also label and range images of every frame.")
+    ] = False,
     show: Annotated[bool, typer.Option(help="Print the scenario as YAML and stop.")] = False,
 ) -> None:
     """Simulate a recording of any rig on a boat in a harbour, with its truth in REC_truth/.
