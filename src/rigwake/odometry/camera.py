@@ -10,6 +10,7 @@ from typing import Literal
 from rigwake.cameras.base import CameraModel
 from rigwake.errors import EstimationError, UnobservableError, UsageError
 from rigwake.geometry.so3 import Array
+from rigwake.odometry.bridged import bridged
 from rigwake.odometry.loop_closure import closed_path, find_loops, joined_tracks
 from rigwake.odometry.measure import Progress, measure_camera
 from rigwake.odometry.metric import MetricStart, metric_start
@@ -151,12 +152,15 @@ class _Run:
         tracks = tracks if lens is None else lens.tracks
         if self.options.loops or visual.counts.segments > 1:
             tracks, visual = self._closed(tracks, visual, rotations)
+        self.notes += bridged(tracks, self.model, visual, self.imu, self.gnss)
         self._done("odometry")
         start = self._start(visual)
         smoothed = None
         if start is not None:
             self.progress("smoothing", 0, 1)
             smoothed = smooth(tracks, self.model, visual, start, self.imu, self.gnss)
+            if smoothed.bridged:
+                self.notes.append(f"{smoothed.bridged} frames without a pose by vision were carried by the IMU")
             self._done("smoothing")
         return CameraOdometry(
             smoothed.trajectory if smoothed is not None else visual.trajectory,
