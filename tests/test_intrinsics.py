@@ -82,6 +82,28 @@ def test_standard_deviations_are_honest_over_50_draws(model: str) -> None:
     assert np.mean(np.abs(np.array(sigmas)) < 3) > 0.985
 
 
+def sheared(observations: BoardObservations, seed: int, std: float) -> BoardObservations:
+    """Each view's picture stretched a little its own way, as a moving board or a shutter does."""
+    rng = np.random.default_rng(seed)
+    views = tuple(
+        replace(
+            view, pixels=view.pixels + (view.pixels - view.pixels.mean(axis=0)) @ rng.normal(0, std, (2, 2))
+        )
+        for view in observations.views
+    )
+    return replace(observations, views=views)
+
+
+def test_errors_that_the_corners_of_a_view_share_widen_the_covariance() -> None:
+    truth = wide_lens("kb4")
+    results = [calibrate(sheared(draw(truth, seed), seed, 3e-3), "kb4") for seed in range(4)]
+    nees = np.array([normalised_error(result, truth)[1] for result in results])
+    widening = np.array([result.widening for result in results])
+    assert np.mean(widening * nees) > 10 * 8  # what independent corners promise: ten times too much
+    assert np.mean(nees) < 2 * 8
+    assert calibrate(draw(truth, 0), "kb4").widening < 1.3
+
+
 @pytest.mark.parametrize("model", ["eucm", "ds", "fov", "kb23", "pinhole", "rational"])
 def test_other_models_recover_their_own_lens(model: str) -> None:
     params = {

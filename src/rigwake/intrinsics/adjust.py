@@ -102,17 +102,11 @@ def linearise(estimate: Estimate, corners: Corners, free: Mask, sigma_px: float 
 
     With `X = R P + t`, a right perturbation of `cam_from_board` moves X by `R (v - P x w)`.
     """
-    projection = estimate.camera.project_with_jacobians(_points_cam(estimate, corners))
-    r = np.where(projection.valid[:, None], projection.pixels - corners.pixels, 0.0)
-    weights = (corners.used & projection.valid).astype(np.float64)
+    J_camera, J_view, r = _jacobians(estimate, corners, free)
     if sigma_px is not None:
-        weights *= np.minimum(1.0, _HUBER * sigma_px / np.maximum(np.linalg.norm(r, axis=1), 1e-12))
-    root = np.sqrt(weights)[:, None, None]
-    J_camera = projection.d_params[:, :, free] * root
-    by_translation = projection.d_point @ estimate.cam_from_board.rotation[corners.view_index]
-    by_rotation = -by_translation @ so3.hat(corners.points_board)
-    J_view = np.concatenate([by_rotation, by_translation], axis=2) * root
-    r = r * root[..., 0]
+        weights = np.minimum(1.0, _HUBER * sigma_px / np.maximum(np.linalg.norm(r, axis=1), 1e-12))
+        root = np.sqrt(weights)[:, None, None]
+        J_camera, J_view, r = J_camera * root, J_view * root, r * root[..., 0]
     slices, count = corners.slices, int(free.sum())
     flat = J_camera.reshape(2 * len(r), count)
     coupling, views = np.empty((len(slices), count, 6)), np.empty((len(slices), 6, 6))
@@ -121,6 +115,29 @@ def linearise(estimate: Estimate, corners: Corners, free: Mask, sigma_px: float 
         J6, JP, rv = J_view[rows].reshape(-1, 6), flat[2 * rows.start : 2 * rows.stop], r[rows].ravel()
         views[v], coupling[v], view_gradients[v] = J6.T @ J6, JP.T @ J6, J6.T @ rv
     return NormalEquations(flat.T @ flat, coupling, views, flat.T @ r.ravel(), view_gradients)
+
+
+def camera_scores(estimate: Estimate, corners: Corners, free: Mask) -> Array:
+    """What each corner (N) adds to the gradient of the free camera parameters once the poses follow: (N, P)."""
+    J_camera, J_view, r = _jacobians(estimate, corners, free)
+    follow = linearise(estimate, corners, free, None).reduced()[2][:, :, :-1]
+    return np.asarray(np.einsum("nap,na->np", J_camera - J_view @ follow[corners.view_index], r))
+
+
+def _jacobians(estimate: Estimate, corners: Corners, free: Mask) -> tuple[Array, Array, Array]:
+    """Of the residuals (N, 2) by free camera parameters (N, 2, P) and by the pose (N, 2, 6), and the residuals
+    themselves; zero for corners that are not used or not seen."""
+    projection = estimate.camera.project_with_jacobians(_points_cam(estimate, corners))
+    counts = (corners.used & projection.valid)[:, None, None]
+    by_translation = projection.d_point @ estimate.cam_from_board.rotation[corners.view_index]
+    by_rotation = -by_translation @ so3.hat(corners.points_board)
+    J_view = np.concatenate([by_rotation, by_translation], axis=2)
+    r = projection.pixels - corners.pixels
+    return (
+        np.where(counts, projection.d_params[:, :, free], 0.0),
+        np.where(counts, J_view, 0.0),
+        np.where(counts[..., 0], r, 0.0),
+    )
 
 
 def _moved(estimate: Estimate, free: Mask, camera_step: Array, view_steps: Array) -> Estimate | None:

@@ -13,7 +13,7 @@ from rigwake.cameras.lens import axis_focal_px
 from rigwake.errors import EstimationError, UnobservableError, UsageError
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
-from rigwake.intrinsics.adjust import Corners, Estimate, adjust, linearise, residuals
+from rigwake.intrinsics.adjust import Corners, Estimate, adjust, camera_scores, linearise, residuals
 from rigwake.intrinsics.initialise import initialise, stacked
 from rigwake.intrinsics.observations import BoardObservations
 
@@ -38,8 +38,9 @@ class IntrinsicCalibration:
     view_names: kept views. residuals_px: (N, 2) projected minus observed, corners (N): what was seen, with
     `used` false for dropped corners. sigma_px: standard deviation of a pixel coordinate, from the residuals.
     rms_px: root mean square distance of used corners. dropped_views: names and reasons.
-    max_observed_angle: radians off the axis of the farthest used corner. axis_focal_std_px: standard deviation
-    of the pixels per radian at the axis.
+    max_observed_angle: radians off the axis of the farthest used corner. widening: by what the covariance is
+    larger than with independent corners, because errors are shared within views and by the board's corners.
+    axis_focal_std_px: standard deviation of the pixels per radian at the axis.
     """
 
     camera: CameraModel
@@ -54,6 +55,7 @@ class IntrinsicCalibration:
     rms_px: float
     dropped_views: tuple[tuple[str, str], ...]
     max_observed_angle: float
+    widening: float
     axis_focal_std_px: float
     converged: bool
 
@@ -186,7 +188,10 @@ def _summary(
     if 2 * used.sum() <= unknowns:
         raise EstimationError(f"{used.sum()} corners cannot determine {unknowns} unknowns.")
     variance = squares / (2 * used.sum() - unknowns)
+    corners = replace(corners, used=used)
     information = _Information.of(linearise(estimate, corners, free, None).reduced()[0], variance)
+    widening = _shared_errors(information, camera_scores(estimate, corners, free), corners)
+    information = replace(information, variance=variance * widening)
     block, lost = information.covariance()
     covariance = np.zeros((len(free), len(free)))
     covariance[np.ix_(free, free)] = block
@@ -203,12 +208,13 @@ def _summary(
         axis_focal_std_px=information.std_along(focal_gradient),
         cam_from_board=estimate.cam_from_board,
         view_names=tuple(view.name for view in observations.views),
-        corners=replace(corners, used=used),
+        corners=corners,
         residuals_px=r,
         sigma_px=float(np.sqrt(variance)),
         rms_px=float(np.sqrt(squares / used.sum())),
         dropped_views=dropped,
         max_observed_angle=float(angles[used].max()),
+        widening=widening,
         converged=converged,
     )
 
@@ -250,6 +256,26 @@ class _Information:
         if np.sum(along[~self.known] ** 2) > _NULL_SHARE * np.sum(along**2):
             return float(np.inf)
         return float(np.sqrt(self.variance * np.sum(along[self.known] ** 2 / self.eigenvalues[self.known])))
+
+
+def _shared_errors(information: _Information, scores: Array, corners: Corners) -> float:
+    """How much larger the variance of the camera's parameters is than independent corners make it, at least 1.
+
+    The scatter of the scores' sums over views (blur, what the model misses) and over the board's corners (a board
+    that is not flat, a print that is not to scale), less what single corners explain: the two-way cluster-robust
+    covariance of Cameron, Gelbach and Miller (2011), as a mean over all determined directions.
+    """
+    known = information.known
+    whitened = (scores / information.scale) @ information.vectors[:, known]
+    whitened = whitened[corners.used] / np.sqrt(information.eigenvalues[known] * information.variance)
+    corner = np.unique(corners.points_board, axis=0, return_inverse=True)[1].ravel()
+    scatter = -float(np.sum(whitened**2))
+    for cluster in (corners.view_index[corners.used], corner[corners.used]):
+        sums = np.zeros((int(cluster.max()) + 1, whitened.shape[1]))
+        np.add.at(sums, cluster, whitened)
+        count = len(np.unique(cluster))
+        scatter += float(np.sum(sums**2)) * count / max(count - 1, 1)
+    return max(scatter / whitened.shape[1], 1.0)
 
 
 def _axis_focal_gradient(camera: CameraModel, free: Mask, scale: Array) -> Array:
