@@ -219,9 +219,10 @@ def _seen_alike(points: Array, sources: Array, centres: Array, options: HandOver
     # relative to one of them, products instead of differences lose no digits
     origin = centres[0]
     points, centres = points - origin, centres - origin
-    squared = np.sum(centres**2, axis=1)[:, None] + np.sum(points**2, axis=1) - 2 * centres @ points.T
+    products = np.einsum("ki,ni->kn", centres, points)
+    squared = np.sum(centres**2, axis=1)[:, None] + np.sum(points**2, axis=1) - 2 * products
     distance = np.sqrt(np.maximum(squared, 0.0))
-    along = centres @ to_source.T - np.sum(points * to_source, axis=1)
+    along = np.einsum("ki,ni->kn", centres, to_source) - np.sum(points * to_source, axis=1)
     stretch = distance / source_range
     alike = (stretch < options.max_stretch) & (stretch > 1 / options.max_stretch)
     return np.asarray(alike & (along > np.cos(np.deg2rad(options.max_view_angle_deg)) * distance))

@@ -19,9 +19,12 @@ from rigwake.bundle.problem import BundleCamera, Indices, Mask, RigProblem, Solv
 from rigwake.bundle.rim import extrapolated
 from rigwake.bundle.robust import robust
 from rigwake.bundle.schur import LinearObservations
+from rigwake.bundle.threads import over_ranges, ranges
 from rigwake.cameras.base import Projection
 from rigwake.geometry import so3
 from rigwake.geometry.so3 import Array
+
+_LEAST_OBSERVATIONS = 10_000  # that are worth a thread
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,20 +119,32 @@ def _directions_of(problem: RigProblem, frames: Frames, poses: TimedPoses) -> Ar
 
 
 def _views(problem: RigProblem, frames: Frames, poses: TimedPoses, points: Array) -> list[_View]:
-    views, observed = [], problem.observations.pixels[frames.order]
-    for camera, rows in zip(problem.cameras, frames.observations, strict=True):
-        y, read_out = points[rows], None
-        if camera.line_delay_s != 0 or "line_delay" in camera.free:
-            read_out = _read_out(problem, camera, frames, poses, rows, y)
-            y = read_out.points
-        projection = camera.model.project_with_jacobians(y)
-        beyond = np.flatnonzero(~projection.valid)
-        if len(beyond):
-            near = extrapolated(camera.model, observed[rows[beyond]], y[beyond])
-            projection.pixels[beyond], projection.valid[beyond] = near.pixels, near.valid
-            projection.d_point[beyond] = near.d_point
-        views.append(_View(rows, read_out, projection, len(beyond)))
-    return views
+    """What the cameras see, one thread each."""
+    found: dict[int, _View] = {}
+
+    def work(first: int, last: int) -> None:
+        for index in range(first, last):
+            found[index] = _view(problem, index, frames, poses, points)
+
+    counts = np.array([len(rows) for rows in frames.observations])
+    over_ranges(ranges(counts, _LEAST_OBSERVATIONS), work)
+    return [found[index] for index in range(len(problem.cameras))]
+
+
+def _view(problem: RigProblem, index: int, frames: Frames, poses: TimedPoses, points: Array) -> _View:
+    camera, rows = problem.cameras[index], frames.observations[index]
+    y, read_out = points[rows], None
+    if camera.line_delay_s != 0 or "line_delay" in camera.free:
+        read_out = _read_out(problem, camera, frames, poses, rows, y)
+        y = read_out.points
+    projection = camera.model.project_with_jacobians(y)
+    beyond = np.flatnonzero(~projection.valid)
+    if len(beyond):
+        observed = problem.observations.pixels[frames.order[rows[beyond]]]
+        near = extrapolated(camera.model, observed, y[beyond])
+        projection.pixels[beyond], projection.valid[beyond] = near.pixels, near.valid
+        projection.d_point[beyond] = near.d_point
+    return _View(rows, read_out, projection, len(beyond))
 
 
 def _compared(
