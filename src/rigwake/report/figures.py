@@ -71,19 +71,29 @@ def _rig(content: ReportContent) -> Figure | None:
         axes.plot(*position, "o", ms=3, color=colour, label=camera.name)
         ahead = camera.rig_from_cam.rotation[:2, 2]
         if np.isfinite(ahead).all():
+            tip = position + 0.5 * ahead
             axes.annotate(
-                "", position + 0.5 * ahead, position, arrowprops={"arrowstyle": "->", "color": colour}
+                "", tip, position, arrowprops={"arrowstyle": "->", "color": colour}, annotation_clip=False
             )
+            axes.update_datalim([tip])
         covariance = camera.covariance_rig_axes[3:5, 3:5]
         if np.isfinite(covariance).all():
             turn = np.linspace(0, 2 * np.pi, 60)
             values, vectors = np.linalg.eigh(covariance)
             ring = vectors @ (3 * np.sqrt(np.maximum(values, 0))[:, None] * [np.cos(turn), np.sin(turn)])
             axes.plot(position[0] + ring[0], position[1] + ring[1], lw=0.8, color=colour)
+    axes.autoscale_view()
     axes.set_aspect("equal", adjustable="datalim")
-    if drawn:
-        axes.legend(frameon=False, fontsize=7)
+    _legend(figure)
     return figure if drawn else None
+
+
+def _legend(figure: Figure) -> None:
+    """The cameras' names above everything, where they cover nothing."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=5, frameon=False, fontsize=7, columnspacing=1.0
+    )
 
 
 def _paths(content: ReportContent) -> Figure | None:
@@ -94,7 +104,7 @@ def _paths(content: ReportContent) -> Figure | None:
     for name, path in paths.items():
         axes.plot(path[:, 0], path[:, 1], lw=0.9, color=_colour(content, name), label=name)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.legend(frameon=False, fontsize=7)
+    _legend(figure)
     return figure
 
 
@@ -106,7 +116,7 @@ def _curves(content: ReportContent, pick: Callable[[ResidualSummary], Curve], x_
         curve = pick(residuals)
         axes.plot(curve.at, curve.median, lw=1, color=_colour(content, name), label=name)
     axes.set_ylim(bottom=0)
-    axes.legend(frameon=False, fontsize=7)
+    _legend(figure)
     return figure
 
 
@@ -118,10 +128,13 @@ def _sigmas(content: ReportContent) -> Figure | None:
     figure = Figure(figsize=(_COLUMN_INCHES, 2.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     for axes, label, factor in ((left, "about x y z (deg)", 1.0), (right, "along x y z (mm)", 1e3)):
-        for name, camera in cameras.items():
+        for k, (name, camera) in enumerate(cameras.items()):
             std = camera.std_rotation_deg if axes is left else camera.std_translation_m
-            axes.plot(range(3), factor * std, "o-", ms=3, lw=0.6, color=_colour(content, name), label=name)
+            beside = np.arange(3) + 0.5 * ((k + 0.5) / len(cameras) - 0.5)
+            axes.plot(beside, factor * std, "o", ms=3, color=_colour(content, name), label=name)
         axes.set_xticks(range(3), ["x", "y", "z"])
-        axes.set(xlabel=label, yscale="log")
-    left.legend(frameon=False, fontsize=6)
+        axes.set_xlabel(label)
+        axes.margins(y=0.1)
+        axes.set_ylim(bottom=0)
+    _legend(figure)
     return figure
