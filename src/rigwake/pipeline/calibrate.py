@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -118,7 +118,9 @@ def _each_camera(
         include={"tracking", "odometry", "find_hull", "seed", "start_s", "duration_s", "imu"}
     )
     print_of_input = input_fingerprint(recording)
-    keys = {name: stage_key(print_of_input, name, settings, odometry) for name in selection.cameras}
+    # what another version left may lack what this one reads
+    written = [__version__, *(part.name for part in fields(CameraOutcome))]
+    keys = {name: stage_key(print_of_input, name, settings, odometry, written) for name in selection.cameras}
     outcomes: dict[str, CameraOutcome] = {}
     jobs = []
     for name, stream in selection.cameras.items():
@@ -142,7 +144,7 @@ def _working(outcomes: list[CameraOutcome]) -> list[str]:
     working = [o.name for o in outcomes if o.failed is None]
     if working:
         return working
-    reasons = " ".join(f"{o.name}: {o.failed}" for o in outcomes)
+    reasons = " ".join(f"{o.name}: {(o.failed or '').removeprefix(f'{o.name}: ')}" for o in outcomes)
     raise UnobservableError(
         f"No camera's motion could be estimated. {reasons}",
         remedy="Record land with texture in view, while the vessel moves and turns; see `rigwake inspect`.",
