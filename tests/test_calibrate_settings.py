@@ -22,6 +22,7 @@ from rigwake.pipeline.outputs import horizon_pixels
 from rigwake.pipeline.prior import RigPrior, load_prior
 from rigwake.pipeline.selection import select
 from rigwake.pipeline.stage_files import StageLedger, stage_key
+from rigwake.recording import AttitudeStream
 from rigwake.simulate.tracks_only import SimulatedTracks
 
 
@@ -162,6 +163,13 @@ class TestSelection:
         chosen = select(world.recording, CalibrateConfig(imu=False, gnss=False))
         assert chosen.imu is None
         assert chosen.gnss is None
+
+    def test_an_attitude_that_is_not_used_is_named(self, world: SimulatedTracks) -> None:
+        compass = AttitudeStream(
+            "compass", np.arange(2), np.stack([np.eye(3)] * 2), np.stack([np.eye(3)] * 2)
+        )
+        chosen = select(replace(world.recording, attitudes={"compass": compass}), CalibrateConfig())
+        assert any("compass" in note and "not used" in note for note in chosen.notes)
 
 
 class TestStageFiles:

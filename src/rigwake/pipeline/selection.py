@@ -64,6 +64,10 @@ def select(recording: Recording, config: CalibrateConfig) -> Selection:
     notes: list[str] = []
     imu = _one("IMU", recording.imus, config.imu, notes)
     gnss = _one("GNSS receiver", recording.gnss, config.gnss, notes)
+    notes.extend(
+        f"attitude {name}: not used; beside an IMU it tells nothing new of the rig, without one its mounting is unknown"
+        for name in recording.attitudes
+    )
     windowed = {name: _window(camera, begin, end) for name, camera in cameras.items()}
     for name, camera in list(windowed.items()):
         if camera.model is None:
