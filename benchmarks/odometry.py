@@ -1,6 +1,6 @@
 """Odometry on real and simulated recordings: ours, the frame-to-frame baseline and pycolmap on the same frames.
 
-    python benchmarks/odometry.py [kitti] [stereo] [harbour] [euroc] [--peers]
+    python benchmarks/odometry.py [kitti] [stereo] [harbour] [euroc] [speed] [--peers]
 
 Data: RIGWAKE_DATA, or ../shared/data beside the project. ATE in metres after the named alignment; CPU seconds of
 this process, tracking included. A path given in RIGWAKE_KITTI (the full odometry data set) adds its sequences 00-10.
@@ -12,6 +12,7 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -33,6 +34,7 @@ from rigwake.readers.open import open_recording
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.recording import CameraStream
 from rigwake.tracking.front_ends import track_camera
+from rigwake.tracking.options import FrontEndName, TrackingOptions
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
@@ -229,6 +231,23 @@ def harbour(peers: bool) -> None:
             pycolmap_row(f"harbour_a {name}", stream, truth, refine=False)
 
 
+def speed(peers: bool) -> None:
+    """Frames per second of vision + IMU on one camera, by front end; CPU and wall time of both cores."""
+    recording = open_recording(DATA / "harbour_a" / "harbour_a.bag")
+    stream, imu = recording.camera("front"), next(iter(recording.imus.values()))
+    print("| front end | frames/s | frames/CPU-s | tracking only: frames/s |\n|---|---|---|---|", flush=True)
+    for front_end in get_args(FrontEndName):
+        options = CameraOdometryOptions(tracking=TrackingOptions(front_end=front_end))
+        wall_s, cpu_s = time.perf_counter(), time.process_time()
+        result = run_camera(stream, imu, options=options)
+        wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
+        tracking = result.tracks.report.frames_per_second
+        print(
+            f"| {front_end} | {len(stream) / wall_s:.1f} | {len(stream) / cpu_s:.1f} | {tracking:.1f} |",
+            flush=True,
+        )
+
+
 def labels(name: str, result) -> None:
     """Share of inliers on water and hull in the first frame, where labels are known."""
     image = cv2.imread(str(DATA / "harbour_a" / f"truth_labels_{name}.png"), cv2.IMREAD_GRAYSCALE)
@@ -265,14 +284,15 @@ def euroc(peers: bool) -> None:
     )
 
 
+SECTIONS = {"kitti": kitti, "stereo": stereo, "harbour": harbour, "euroc": euroc, "speed": speed}
+
+
 def main() -> None:
-    chosen = [a for a in sys.argv[1:] if not a.startswith("-")] or ["kitti", "stereo", "harbour", "euroc"]
+    chosen = [a for a in sys.argv[1:] if not a.startswith("-")] or list(SECTIONS)
     print(HEADER, flush=True)
     for name in chosen:
         try:
-            {"kitti": kitti, "stereo": stereo, "harbour": harbour, "euroc": euroc}[name](
-                "--peers" in sys.argv
-            )
+            SECTIONS[name]("--peers" in sys.argv)
         except RigwakeError as error:
             print(f"| {name} | failed: {error} |" + " |" * 7, flush=True)
 
