@@ -160,7 +160,9 @@ class _Run:
             self.progress("smoothing", 0, 1)
             smoothed = smooth(tracks, self.model, visual, start, self.imu, self.gnss)
             if smoothed.bridged:
-                self.notes.append(f"{smoothed.bridged} frames without a pose by vision were carried by the IMU")
+                self.notes.append(
+                    f"{smoothed.bridged} frames without a pose by vision were carried by the IMU"
+                )
             self._done("smoothing")
         return CameraOdometry(
             smoothed.trajectory if smoothed is not None else visual.trajectory,
