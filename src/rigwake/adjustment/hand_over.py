@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake.adjustment.cross_camera import find_landmarks
+from rigwake.adjustment.level import at_one_height, with_priors_of
 from rigwake.adjustment.proposals import HandOverOptions, predicted_pixels, propose_searches
 from rigwake.adjustment.rounds import MAD_TO_STD, adjust
 from rigwake.adjustment.values import AdjustedRig, AdjustmentOptions, AssembledProblem
@@ -53,10 +54,16 @@ def adjust_with_hand_over(
     """The rig adjusted with landmarks found again in other cameras and at other times.
 
     Every round predicts with what the one before has found. In the last, some of the agreeing observations
-    are kept back.
+    are kept back. Heights that nothing has told yet are held until then.
     """
     used, unused = 0, Observations.empty()
-    usable = _usable(masks_folder, adjusted.solution.problem)
+    free = adjusted.solution.problem
+    usable = _usable(masks_folder, free)
+    level = at_one_height(free)
+    if level is not free:
+        tell("adjusting with cameras held near one height")
+        held = AssembledProblem(level, adjusted.track_cameras, adjusted.track_ids)
+        adjusted = adjust(held, replace(options, rounds=1), to_be_continued=True)
     for done in range(search.rounds):
         last = done == search.rounds - 1
         problem = adjusted.solution.problem
@@ -72,7 +79,10 @@ def adjust_with_hand_over(
         found = _weighed(found, adjusted.solution)
         tell(f"adjusting with {len(found)} observations handed over")
         with_found = AssembledProblem(
-            replace(problem, observations=joined(problem.observations, found)),
+            replace(
+                with_priors_of(problem, free) if last else problem,
+                observations=joined(problem.observations, found),
+            ),
             adjusted.track_cameras,
             adjusted.track_ids,
         )

@@ -13,7 +13,7 @@ import numpy as np
 
 from rigwake.adjustment.values import RigStart
 from rigwake.bundle.problem import BundleCamera, CameraParameter
-from rigwake.calibration import Calibration
+from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.cameras.base import CameraModel
 from rigwake.errors import RigwakeError, UnobservableError
 from rigwake.geometry.se3 import SE3
@@ -62,7 +62,7 @@ def first_rig(
     }
     if result is not None:
         for name, member in result.members.items():
-            rig_from_cam = lead.rig_from_cam * result.ref_from_members[name]
+            rig_from_cam = lead.rig_from_cam * _beside_leader(member, result.ref_from_members[name])
             offset_s = lead.time_offset_s + (member.time_offset_s or 0.0)
             cameras[name] = _camera(name, models[name], rig_from_cam, offset_s, held=False)
     start = RigStart(
@@ -74,6 +74,21 @@ def first_rig(
     )
     handeye = Calibration(leader, {}) if result is None else result.calibration()
     return FirstRig(start, handeye, leader, lead.scale_source, failed, lead.notes)
+
+
+def _beside_leader(member: CalibratedCamera, leader_from_cam: SE3) -> SE3:
+    """The transform without its offset along directions that the motion left open, where it is arbitrary.
+
+    Cameras of a vessel differ by less in height than nothing would leave them, and landmarks are looked for in
+    other cameras' images where the start has them.
+    """
+    offset = leader_from_cam.translation
+    for open_direction in member.undetermined:
+        turn, along = open_direction.direction[:3], open_direction.direction[3:]
+        if np.linalg.norm(along) > np.linalg.norm(turn):
+            along = along / np.linalg.norm(along)
+            offset = offset - (along @ offset) * along
+    return SE3(leader_from_cam.rotation, offset)
 
 
 def _camera(name: str, model: CameraModel, rig_from_cam: SE3, offset_s: float, *, held: bool) -> BundleCamera:

@@ -20,6 +20,7 @@ from rigwake.handeye.information import USEFUL_ROTATION, USEFUL_TRANSLATION
 from rigwake.handeye.observability import open_directions
 
 _OPEN_ROTATION, _OPEN_TRANSLATION = np.deg2rad(50.0), 10.0  # stands for "not at all" in a covariance
+_CANCELLED = 1e-4  # shares below this are what directions known to 1e-5 leave of a difference
 _GIVE_SCALE = "Give a scale: an IMU, GNSS, a known baseline (--prior), or metric --trajectories."
 
 
@@ -178,8 +179,10 @@ def _with_open_directions(covariance: RigCovariance, rows: Array) -> Array:
     lost = rows @ covariance.undetermined.T
     if lost.shape[1]:
         units = np.tile(np.repeat([_OPEN_ROTATION, _OPEN_TRANSLATION], 3), len(rows) // 6)
+        # an open direction that all cameras share does not touch one as seen from another: what is left is rounding
         sizes = np.linalg.norm(lost / units[:, None], axis=0)
-        lost = lost[:, sizes > 1e-9 * max(float(sizes.max()), 1e-300)]
+        without_cancelling = np.abs(rows) @ np.abs(covariance.undetermined.T) / units[:, None]
+        lost = lost[:, sizes > _CANCELLED * np.linalg.norm(without_cancelling, axis=0)]
         lost = lost / np.maximum(np.abs(lost / units[:, None]).max(axis=0), 1e-12)
         joint = joint + lost @ lost.T
     return np.asarray(joint)
