@@ -53,6 +53,23 @@ def test_a_tape_measure_knows_better(calm: SimulatedTracks) -> None:
     assert [c.rig_from_cam_prior for c in at_one_height(told).cameras] == [tape, tape]
 
 
+def test_rounding_does_not_open_what_cancels(calm: SimulatedTracks) -> None:
+    adjusted = adjust(assembled(calm), OPTIONS)
+    found = covariance_of(adjusted.solution.problem)
+    names = [camera.name for camera in adjusted.solution.problem.cameras]
+    # one open direction, shared by both cameras up to rounding; all else well known
+    shared = sum(
+        camera.rig_from_cam.rotation[2] @ found.rows_of(camera.name, "rig_from_cam")[3:]
+        for camera in adjusted.solution.problem.cameras
+    )
+    shared = shared + 1e-9 * np.random.default_rng(0).normal(size=len(shared))
+    basis, _ = np.linalg.qr(np.column_stack([shared, np.eye(len(shared))[:, 1:]]))
+    shares = np.where(np.arange(len(shared)) == 0, 0.0, 1e4)
+    known = replace(found, scale=np.ones(len(shared)), directions=basis, shares=shares, excess=None)
+    seen = calibrated_cameras(adjusted.solution, known, ReferenceFrame(names[0], None), {}, {})
+    assert seen.cameras[names[1]].is_determined
+
+
 def test_a_height_that_all_cameras_share_is_not_open_between_them(calm: SimulatedTracks) -> None:
     whole = assembled(calm)
     truth = rig_in_frame(calm.recording.true_rig, "imu")
