@@ -1,10 +1,11 @@
 """The rig of recordings with known truth, by method: seed pipeline, hand-eye only, without and with hand-over.
 
-    python benchmarks/calibrate.py [RECORDING TRUTH]...
+    python benchmarks/calibrate.py [--peers] [RECORDING TRUTH]...
 
-Without arguments: `harbour_a` in RIGWAKE_DATA, or in ../shared/data beside the project. Errors are those of the
-worst pair of cameras, which needs no common reference. Seconds and peak memory are of the whole process and its
-children, from images to calibration; `hand-eye only` stops before the adjustment, so it has no figures of its own.
+Without arguments: `harbour_a` in RIGWAKE_DATA, or in ../shared/data beside the project. --peers: pycolmap too, see
+`colmap_rig.py` (some ten minutes). Errors are those of the worst pair of cameras, which needs no common reference.
+Seconds and peak memory are of the whole process and its children, from images to calibration; `hand-eye only` stops
+before the adjustment, so it has no figures of its own.
 """
 
 import os
@@ -29,6 +30,7 @@ from rigwake.readers.truth import read_true_rig, rig_in_frame
 from rigwake.rig import Rig
 from rigwake.tracks import load_tracks
 
+PEER_RATE_HZ = 1.0  # all pairs of images are matched: twice the rate takes four times as long
 DATA = Path(os.environ.get("RIGWAKE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
 
@@ -69,7 +71,17 @@ def seed_pipeline(recording: Path, out: Path) -> Calibration | str:
         return str(error.cause)
 
 
-def compare(recording: Path, truth_file: Path) -> None:
+def pycolmap_rig(recording: Path) -> Calibration | str:
+    """The peer, with one image per camera and second."""
+    from colmap_rig import colmap_rig
+
+    try:
+        return colmap_rig(recording, PEER_RATE_HZ)
+    except RigwakeError as error:
+        return str(error.cause)
+
+
+def compare(recording: Path, truth_file: Path, peers: bool) -> None:
     name, truth = recording.stem, read_true_rig(truth_file)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
@@ -89,16 +101,22 @@ def compare(recording: Path, truth_file: Path) -> None:
         cpu = cpu_s()
         found = seed_pipeline(recording, out)
         row(name, "seed pipeline", found, truth, f"{cpu_s() - cpu:.0f} CPU s after tracking")
+    if peers:
+        wall, cpu = time.perf_counter(), cpu_s()
+        found = pycolmap_rig(recording)
+        wall, cpu = time.perf_counter() - wall, cpu_s() - cpu
+        row(name, f"pycolmap, {PEER_RATE_HZ:g} Hz", found, truth, f"{cpu:.0f} CPU s, {wall:.0f} s")
 
 
 def main() -> None:
-    given = [Path(argument) for argument in sys.argv[1:]]
-    pairs = list(zip(given[::2], given[1::2], strict=True)) or [
+    given = [argument for argument in sys.argv[1:] if argument != "--peers"]
+    paths = [Path(argument) for argument in given]
+    pairs = list(zip(paths[::2], paths[1::2], strict=True)) or [
         (DATA / "harbour_a" / "harbour_a.bag", DATA / "harbour_a" / "truth.yaml")
     ]
     print("| recording | method | rotation deg | translation cm | used |\n" + "|---" * 5 + "|")
     for recording, truth in pairs:
-        compare(recording, truth)
+        compare(recording, truth, "--peers" in sys.argv)
 
 
 if __name__ == "__main__":
