@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,13 +54,12 @@ def measure_camera(
     """
     notes: list[str] = []
     marks = [time.perf_counter()]
-    progress("looking for lens border and hull", 0, 1)
-    mask = _mask(stream, hull, mask_file, notes)
-    marks.append(time.perf_counter())
-    gyro = None
-    if imu is not None:
-        progress("comparing its turns with the gyro", 0, 1)
-        gyro = _gyro(stream, imu, notes)
+    progress("looking for lens border and hull, comparing its turns with the gyro", 0, 1)
+    with ThreadPoolExecutor(1) as beside:
+        turning = beside.submit(_gyro, stream, imu)
+        mask = _mask(stream, hull, mask_file, notes)
+        gyro, gyro_notes = turning.result()
+    notes += gyro_notes
     marks.append(time.perf_counter())
     up_cam = None
     if horizon and gyro is not None and imu is not None:
@@ -72,7 +72,7 @@ def measure_camera(
     rotations = None
     if gyro is not None and imu is not None:
         rotations = camera_rotations(imu, gyro, tracks.timestamps_ns)
-    stages = ("masks", "gyroscope", "tracking")
+    stages = ("masks and gyroscope", "tracking")
     seconds = {stage: marks[k + 1] - marks[k] for k, stage in enumerate(stages)}
     return CameraMeasurement(mask, tracks, rotations, tuple(notes), seconds)
 
@@ -91,10 +91,11 @@ def _mask(stream: CameraStream, hull: bool, mask_file: Path | None, notes: list[
     return mask
 
 
-def _gyro(stream: CameraStream, imu: ImuStream, notes: list[str]) -> GyroAlignment | None:
-    """How camera and IMU are turned towards each other, roughly; None where that cannot be told yet."""
+def _gyro(stream: CameraStream, imu: ImuStream | None) -> tuple[GyroAlignment | None, list[str]]:
+    """How camera and IMU are turned towards each other, roughly; None, and why, where that cannot be told yet."""
+    if imu is None:
+        return None, []
     try:
-        return align_gyro(visual_turns(stream), imu)
+        return align_gyro(visual_turns(stream), imu), []
     except (UnobservableError, EstimationError) as error:
-        notes.append(f"tracking is not aided by the gyroscope: {error.cause}")
-        return None
+        return None, [f"tracking is not aided by the gyroscope: {error.cause}"]

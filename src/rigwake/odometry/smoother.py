@@ -48,8 +48,9 @@ _EDGE_NS = (
 _MIN_VIEWS = 3
 _MIN_LANDMARKS = 20
 _GATE_STDS = 4.0
-_ROUGH = SolverOptions(loss="cauchy", tolerance=1e-4, max_iterations=30)
-_FINE = SolverOptions(loss="huber", tolerance=1e-6, max_iterations=30)
+# hardly damped: what the IMU leaves weak would creep towards its place, step by step
+_FINE = SolverOptions(loss="huber", tolerance=1e-6, max_iterations=30, initial_damping=1e-8)
+_ROUGH = replace(_FINE, loss="cauchy", shared_tolerance=0.5)  # only outliers and the noise are taken from it
 # about and along level axes: heading and position are what an IMU cannot tell, the rest is left to it
 _GAUGE_STD = np.array([10.0, 10.0, 1e-4, 1e-4, 1e-4, 1e-4])
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from rigwake.cameras.base import CameraModel, Mask
 from rigwake.errors import UsageError
 from rigwake.geometry.so3 import Array
-from rigwake.recording import CameraStream, Image
+from rigwake.recording import CameraStream, Frame, Image
 from rigwake.tracking.descriptor_front_end import DescriptorFrontEnd
 from rigwake.tracking.klt_front_end import KltFrontEnd, Observed
 from rigwake.tracking.masks import CameraMask, lens_mask, shrunk
@@ -56,7 +57,7 @@ def track_camera(
     run = _Run()
     row_of_index = {int(index): row for row, index in enumerate(chosen)}
     started = time.perf_counter()
-    for done, frame in enumerate(stream.frames(chosen)):
+    for done, frame in enumerate(_ahead(stream.frames(chosen))):
         kind = run.judge(frame.image)
         if kind == "usable":
             row = row_of_index[frame.index]
@@ -71,6 +72,15 @@ def track_camera(
         if progress is not None:
             progress(done + 1)
     return run.tracks(stream, chosen, time.perf_counter() - started)
+
+
+def _ahead(frames: Iterator[Frame]) -> Iterator[Frame]:
+    """The frames, each read and decoded while the one before is worked on."""
+    with ThreadPoolExecutor(1) as reader:
+        upcoming = reader.submit(next, frames, None)
+        while (frame := upcoming.result()) is not None:
+            upcoming = reader.submit(next, frames, None)
+            yield frame
 
 
 class FrontEnd(Protocol):
