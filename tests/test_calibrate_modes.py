@@ -1,7 +1,10 @@
 """Every combination of sensors, and motions that cannot tell: from tracks to verdicts, without pictures."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import yaml
 
 from calibration_worlds import (
     STANDSTILL,
@@ -16,7 +19,8 @@ from calibration_worlds import (
 )
 from rigwake.bundle.problem import VectorPrior
 from rigwake.errors import UnobservableError
-from rigwake.pipeline.prior import Baseline, RigPrior
+from rigwake.geometry.se3 import SE3
+from rigwake.pipeline.prior import Baseline, RigPrior, load_prior
 from rigwake.simulate.tracks_only import SimulatedTracks
 from rigwake.trajectory import Trajectory
 
@@ -107,6 +111,29 @@ def test_a_baseline_is_a_measurement_beside_the_sensors(
     )
     front, left = (found.calibration.cameras[name].rig_from_cam.translation for name in ("front", "left"))
     assert np.linalg.norm(front - left) == pytest.approx(known.distance_m, abs=1e-3)
+
+
+def test_a_prior_off_by_20_degrees_and_half_a_metre_leaves_the_optimum_where_it_is(
+    world: SimulatedTracks, odometry: dict[str, Trajectory], tmp_path: Path
+) -> None:
+    without = calibrated(world, trajectories=odometry)
+    off = SE3.exp(np.array([*np.deg2rad([12.0, 12.0, 10.6]), 0.3, -0.3, 0.26]))
+    entries = {}
+    for name, camera in without.truth.cameras.items():
+        wrong = camera.rig_from_cam * off
+        entries[name] = {
+            "rig_from_cam": {
+                "quat_wxyz": wrong.quat_wxyz.tolist(),
+                "translation_m": wrong.translation.tolist(),
+            },
+            "std": {"rotation_deg": [20.0] * 3, "translation_m": [0.5] * 3},
+        }
+    file = tmp_path / "tape.yaml"
+    file.write_text(yaml.safe_dump({"cameras": entries}))
+    told = calibrated(world, trajectories=odometry, prior=load_prior(file))
+    for name, camera in told.calibration.cameras.items():
+        moved = without.calibration.cameras[name].rig_from_cam.local(camera.rig_from_cam)
+        assert np.abs(np.linalg.solve(np.linalg.cholesky(camera.covariance), moved)).max() < 0.5
 
 
 def test_clocks_20_ms_apart_are_found(world: SimulatedTracks) -> None:
