@@ -36,6 +36,7 @@ from rigwake.report import build_report, load_report_content
 from rigwake.tracks import load_tracks
 from rigwake.trajectory import Trajectory
 
+_NOISY_IMU = 2.0  # times its promise: worth a word
 _LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "poselib", "rosbags")
 
 
@@ -93,6 +94,7 @@ def calibrate(
     )
     failed = {o.name: o.failed for o in outcomes if o.failed is not None} | dict(first.failed)
     notes = (*selection.notes, *(f"{o.name}: {n}" for o in outcomes for n in o.notes), *first.notes)
+    notes += _noisy_imu(rig.calibration)
     calibration = replace(
         rig.calibration,
         checks={**rig.calibration.checks, "failed_cameras": failed, "notes": list(notes)},
@@ -168,6 +170,16 @@ def _trajectories(working: list[str], out: Path, foreign: Path | str | None) -> 
             remedy=f"Name the files {', '.join(f'{name}.tum' for name in working)}.",
         )
     return found
+
+
+def _noisy_imu(calibration: Calibration) -> tuple[str, ...]:
+    """Words about an IMU whose residuals are far beyond its noise densities."""
+    return tuple(
+        f"imu: {sensor} noise {factor:.1f} times what was promised (vibration, a loose mount, or wrong densities); "
+        "the deviations count it"
+        for sensor, factor in calibration.checks.get("imu_noise_factors", {}).items()
+        if factor > _NOISY_IMU
+    )
 
 
 def _provenance(recording: Path, config: CalibrateConfig, first: FirstRig) -> dict[str, Any]:
