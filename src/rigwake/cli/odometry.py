@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
 from queue import Empty
-from typing import TYPE_CHECKING, Annotated, Any, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast, get_args
 
 import typer
 from rich.markup import escape
@@ -18,7 +18,7 @@ from rigwake.errors import RigwakeError
 
 if TYPE_CHECKING:
     from rigwake.odometry.camera import CameraOdometry, CameraOdometryOptions
-    from rigwake.recording import CameraStream, GnssStream, ImuStream, Recording
+    from rigwake.recording import AttitudeStream, CameraStream, GnssStream, ImuStream, Recording
 
 
 def command(
@@ -31,6 +31,12 @@ def command(
     method: Annotated[str, typer.Option(help="adjusted, or the frame-to-frame baseline: seed.")] = "adjusted",
     imu: Annotated[bool, typer.Option("--imu/--no-imu", help="Use the recording's IMU.")] = True,
     gnss: Annotated[bool, typer.Option("--gnss/--no-gnss", help="Use the recording's GNSS.")] = True,
+    attitude: Annotated[
+        bool,
+        typer.Option(
+            "--attitude/--no-attitude", help="With an IMU and no GNSS: heading from the recording's attitude."
+        ),
+    ] = True,
     hull: Annotated[bool, typer.Option("--hull/--no-hull", help="Look for the own boat in view.")] = True,
     horizon: Annotated[
         bool,
@@ -79,8 +85,12 @@ def command(
         refine_lens=refine_lens,
     )
     streams = list(opened.cameras.values()) if camera == "all" else [opened.camera(camera)]
-    sensors = _first(opened.imus) if imu else None, _first(opened.gnss) if gnss else None
-    results = _run_all(streams, *sensors, options)
+    sensors = Sensors(
+        _first(opened.imus) if imu else None,
+        _first(opened.gnss) if gnss else None,
+        _first(opened.attitudes) if attitude else None,
+    )
+    results = _run_all(streams, sensors, options)
     if json_file is not None:
         write_json(json_file, _summary(opened, results))
     _keep(results, output, quiet=str(json_file) == "-")
@@ -109,10 +119,17 @@ def _first(streams: Any) -> Any:
 Report = Callable[[str, int, int], None]
 
 
+class Sensors(NamedTuple):
+    """What is used beside the camera."""
+
+    imu: ImuStream | None
+    gnss: GnssStream | None
+    attitude: AttitudeStream | None
+
+
 def _run_all(
     streams: list[CameraStream],
-    imu: ImuStream | None,
-    gnss: GnssStream | None,
+    sensors: Sensors,
     options: CameraOdometryOptions,
 ) -> dict[str, CameraOdometry | RigwakeError]:
     """Every camera in a process of its own, as many at a time as there are processors."""
@@ -125,11 +142,11 @@ def _run_all(
 
         if len(streams) == 1:
             only = streams[0]
-            return {only.name: _attempt(only, imu, gnss, options, lambda *state: show(only.name, *state))}
+            return {only.name: _attempt(only, sensors, options, lambda *state: show(only.name, *state))}
         context = multiprocessing.get_context("spawn")
         with context.Manager() as manager, ProcessPoolExecutor(workers, mp_context=context) as pool:
             queue = manager.Queue()
-            futures = {s.name: pool.submit(_in_process, s, imu, gnss, options, queue) for s in streams}
+            futures = {s.name: pool.submit(_in_process, s, sensors, options, queue) for s in streams}
             while any(not future.done() for future in futures.values()):
                 _drain(queue, show)
             return {name: _outcome(future) for name, future in futures.items()}
@@ -153,25 +170,25 @@ def _outcome(future: Future[tuple[CameraOdometry | None, tuple[str, str, str, in
 
 
 def _in_process(
-    stream: CameraStream, imu: Any, gnss: Any, options: CameraOdometryOptions, queue: Any
+    stream: CameraStream, sensors: Sensors, options: CameraOdometryOptions, queue: Any
 ) -> tuple[CameraOdometry | None, tuple[str, str, str, int] | None]:
     """One camera; an error travels between processes as its words, since exceptions pickle only their message."""
     import cv2
 
     cv2.setNumThreads(1)  # the processes share the processors already
-    result = _attempt(stream, imu, gnss, options, lambda *state: queue.put((stream.name, *state)))
+    result = _attempt(stream, sensors, options, lambda *state: queue.put((stream.name, *state)))
     if isinstance(result, RigwakeError):
         return None, (result.cause, result.consequence, result.remedy, result.exit_code)
     return result, None
 
 
 def _attempt(
-    stream: CameraStream, imu: Any, gnss: Any, options: CameraOdometryOptions, report: Report
+    stream: CameraStream, sensors: Sensors, options: CameraOdometryOptions, report: Report
 ) -> CameraOdometry | RigwakeError:
     from rigwake.odometry.camera import run_camera
 
     try:
-        return run_camera(stream, imu, gnss, options, report)
+        return run_camera(stream, sensors.imu, sensors.gnss, options, report, sensors.attitude)
     except RigwakeError as error:
         return error
 

@@ -21,7 +21,7 @@ from rigwake.odometry.seed import SeedOptions, estimate_seed
 from rigwake.odometry.self_calibration import RefinedLens, estimate_refining_lens
 from rigwake.odometry.smoother import SmoothedOdometry, smooth
 from rigwake.odometry.turning import estimate_turning
-from rigwake.recording import CameraStream, GnssStream, ImuStream
+from rigwake.recording import AttitudeStream, CameraStream, GnssStream, ImuStream
 from rigwake.tracking.masks import CameraMask
 from rigwake.tracking.options import TrackingOptions
 from rigwake.tracks import Tracks
@@ -80,10 +80,12 @@ def run_camera(
     gnss: GnssStream | None = None,
     options: CameraOdometryOptions | None = None,
     progress: Progress | None = None,
+    attitude: AttitudeStream | None = None,
 ) -> CameraOdometry:
     """Masks, tracks, visual odometry and, with an IMU or GNSS, the metric smoother.
 
-    progress: told stage, done and total. Raises UsageError without intrinsics, EstimationError where the images do
+    attitude: of the IMU's axes, used where there is an IMU and no GNSS: the path's heading. progress: told stage, done
+    and total. Raises UsageError without intrinsics, EstimationError where the images do
     not allow a start. Sensors that cannot tell the scale are named in the notes, and the result is up to scale.
     """
     options = options or CameraOdometryOptions()
@@ -91,7 +93,7 @@ def run_camera(
         raise UsageError(
             f"camera {stream.name} has no intrinsics.", remedy="Calibrate one with `rigwake intrinsics`."
         )
-    run = _Run(stream, imu, gnss, options, progress or (lambda stage, done, total: None))
+    run = _Run(stream, imu, gnss, attitude, options, progress or (lambda stage, done, total: None))
     return run.seed() if options.method == "seed" else run.adjusted()
 
 
@@ -103,12 +105,13 @@ class _Run:
         stream: CameraStream,
         imu: ImuStream | None,
         gnss: GnssStream | None,
+        attitude: AttitudeStream | None,
         options: CameraOdometryOptions,
         progress: Progress,
     ) -> None:
         assert stream.model is not None
         self.stream, self.model = stream, stream.model
-        self.imu, self.gnss = imu, gnss
+        self.imu, self.gnss, self.attitude = imu, gnss, attitude
         self.options = options
         self.progress = progress
         self.notes: list[str] = []
@@ -158,7 +161,7 @@ class _Run:
         smoothed = None
         if start is not None:
             self.progress("smoothing", 0, 1)
-            smoothed = smooth(tracks, self.model, visual, start, self.imu, self.gnss)
+            smoothed = smooth(tracks, self.model, visual, start, self.imu, self.gnss, self.attitude)
             if smoothed.bridged:
                 self.notes.append(
                     f"{smoothed.bridged} frames without a pose by vision were carried by the IMU"

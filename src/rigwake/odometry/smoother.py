@@ -33,10 +33,11 @@ from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
 from rigwake.geometry.triangulation import triangulate_rays
 from rigwake.odometry.gnss import CHI_SQUARE_3_999, CHI_SQUARE_3_MEDIAN
+from rigwake.odometry.heading import headed
 from rigwake.odometry.inertial import with_noise
 from rigwake.odometry.metric import MetricStart
 from rigwake.odometry.result import OdometryResult
-from rigwake.recording import GnssStream, ImuStream
+from rigwake.recording import AttitudeStream, GnssStream, ImuStream
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
@@ -85,10 +86,12 @@ def smooth(
     start: MetricStart,
     imu: ImuStream | None = None,
     gnss: GnssStream | None = None,
+    attitude: AttitudeStream | None = None,
 ) -> SmoothedOdometry:
     """Adjust states, landmarks, mounting, clock offset and biases of a single-camera rig together.
 
-    start: from `metric_start` of the same streams. Observations: inliers of the visual odometry at the states'
+    start: from `metric_start` of the same streams. attitude: of the IMU's axes; gives the world its heading, and holds
+    it, where GNSS does not (see `heading.py`). Observations: inliers of the visual odometry at the states'
     frames. With an IMU there are four states per second and the camera's `rig_from_cam` and clock offset are free;
     without, a state per frame and the rig is the camera. Two rounds, between which outliers go and the noise of
     the pixels is set to what the residuals show.
@@ -96,7 +99,11 @@ def smooth(
     Raises EstimationError if too few landmarks are seen or the adjustment does not succeed.
     """
     noisy_imu = with_noise(imu) if imu is not None else None
-    problem = _problem(tracks, camera, visual, start, noisy_imu, gnss)
+    if gnss is not None or imu is None:
+        attitude = None
+    if attitude is not None:
+        start = headed(start, attitude)
+    problem = _problem(tracks, camera, visual, start, noisy_imu, gnss, attitude)
     rough = solve(problem, _ROUGH)
     weighted, noise_factor = _reweighted(rough)
     weighted, gated = _gated(weighted)
@@ -125,6 +132,7 @@ def _problem(
     start: MetricStart,
     imu: ImuStream | None,
     gnss: GnssStream | None,
+    attitude: AttitudeStream | None,
 ) -> RigProblem:
     chosen = _state_rows(start.world_from_cam, start.time_offset_s, imu)
     cam_stamps = start.world_from_cam.timestamps_ns[chosen]
@@ -154,7 +162,8 @@ def _problem(
         imu=imu,
         gnss=_chosen_fixes(gnss, start.gnss_used) if with_gnss else None,
         antenna=Antenna(start.antenna_rig if start.antenna_rig is not None else np.zeros(3), free=with_gnss),
-        poses=None if with_gnss else _level_gauge(rig_poses[0]),
+        attitude=attitude,
+        poses=None if with_gnss else _level_gauge(rig_poses[0], holds_heading=attitude is None),
     )
 
 
@@ -221,10 +230,13 @@ def _chosen_fixes(gnss: GnssStream | None, used: Array | None) -> GnssStream | N
     )
 
 
-def _level_gauge(first: SE3) -> PoseMeasurements:
-    """Holds position and heading of the first state, which without GNSS nothing determines."""
+def _level_gauge(first: SE3, *, holds_heading: bool) -> PoseMeasurements:
+    """Holds position and, unless something measures it, heading of the first state."""
     axes = np.kron(np.eye(2), first.rotation)
-    covariance = axes.T @ np.diag(_GAUGE_STD**2) @ axes
+    std = _GAUGE_STD.copy()
+    if not holds_heading:
+        std[2] = std[0]
+    covariance = axes.T @ np.diag(std**2) @ axes
     return PoseMeasurements(
         np.array([0]), SE3(first.rotation[None], first.translation[None]), covariance[None]
     )
