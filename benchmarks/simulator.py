@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from rigwake.cameras.catalogue import camera_from_params
-from rigwake.simulate.record import Shot, build_world
+from rigwake.simulate.record import SeaCache, Shot, build_world
 from rigwake.simulate.scenario import load_scenario
 from rigwake.simulate.selfcheck import corner_errors, motion_agreement
 from rigwake.simulate.setup import Simulation, prepare
@@ -39,6 +39,7 @@ def rendering(simulation: Simulation, shots: list[Shot]) -> None:
     renderer = shot.renderer
     times = simulation.scene_times_s(shot.camera)
     seas = [renderer.water(float(t)) for t in times[:IMAGES]]
+    shared = SeaCache(renderer)
     rays = (shot.view.cam_rays @ shot.row_poses(0.0)[0].rotation.T).astype(np.float32)
     mirrored = rays[shot.view.cam_rays[:, 1] > 0] * np.float32([1, 1, -1])
 
@@ -51,7 +52,8 @@ def rendering(simulation: Simulation, shots: list[Shot]) -> None:
         renderer.render(shot.view, shot.row_poses(float(times[index])), seas[index])
 
     def take(index: int) -> None:
-        shots[index % len(shots)].take(index, float(times[index]), renderer.water(float(times[index])))
+        time_s = float(times[index // len(shots)])  # as in a recording: cameras of one instant share its sea
+        shots[index % len(shots)].take(index, time_s, shared.at(time_s))
 
     render(0)
     camera = shot.camera
