@@ -195,6 +195,20 @@ def test_sigmas_of_the_inverse_are_those_of_a_monte_carlo() -> None:
         ({"hand_over": {"count": 9, "median_px": 7.5}}, "usable", "7.5 px off"),
         ({"hand_over": {"count": 0}}, "usable", "No landmark went"),
         (
+            {
+                "hand_over": {
+                    "count": 92,
+                    "median_px": 0.13,
+                    "by_pair": {
+                        "aft->port": {"count": 90, "median_px": 0.12},
+                        "aft->mast": {"count": 2, "median_px": 3.1},
+                    },
+                }
+            },
+            "usable",
+            "aft->mast 3.1 px",
+        ),
+        (
             {"hand_over": {"count": 9, "median_px": 0.5, "by_pair": {"aft->aft": {"count": 9}}}},
             "usable",
             "No landmark went",

@@ -17,6 +17,7 @@ GOOD_ROTATION_DEG = 0.1
 GOOD_POSITION_M = 0.03
 AGREEING_SIGMAS = 3.0
 GOOD_HAND_OVER_PX = 2.0
+ODD_PAIR_PX, ODD_PAIR_RATIO = 1.0, 5.0  # a pair of cameras that is off by more than both stands out
 
 
 @dataclass(frozen=True)
@@ -173,6 +174,13 @@ def _hand_over(checks: Mapping[str, Any]) -> Reason:
     words = (
         f"{count:.0f} landmarks, predicted into images not used for them, land {median:.2g} px off (median)"
     )
+    odd = _odd_pairs(hand_over, median)
+    if odd:
+        return Reason(
+            False,
+            f"{words}, but from camera to camera {', '.join(odd)}: one of them may be tied by wrong matches.",
+            "Look at the hand-over pictures, and compare with --set adjustment.cross_camera=false.",
+        )
     if median <= GOOD_HAND_OVER_PX:
         return Reason(True, f"{words}.")
     return Reason(
@@ -180,6 +188,17 @@ def _hand_over(checks: Mapping[str, Any]) -> Reason:
         f"{words}; good means at most {GOOD_HAND_OVER_PX:g} px.",
         "Look at the hand-over pictures: one camera off in all of them points to its lens or its mount.",
     )
+
+
+def _odd_pairs(hand_over: Any, median_px: float) -> list[str]:
+    """Pairs of cameras whose landmarks land far off although all others do not: `a->b 3.1 px`."""
+    pairs = hand_over.get("by_pair") if isinstance(hand_over, Mapping) else None
+    found = {
+        str(pair): (_number(entry, "median_px") or 0.0, _number(entry, "count") or 0)
+        for pair, entry in (pairs.items() if isinstance(pairs, Mapping) else ())
+    }
+    limit_px = max(ODD_PAIR_PX, ODD_PAIR_RATIO * median_px)
+    return [f"{pair} {off:.2g} px" for pair, (off, count) in found.items() if off > limit_px and count > 1]
 
 
 def _between_cameras(hand_over: Any) -> bool:
