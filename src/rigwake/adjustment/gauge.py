@@ -22,11 +22,8 @@ def with_gauge(problem: RigProblem) -> RigProblem:
         return problem
     states = problem.states
     if problem.imu is not None:
-        std = np.array([1.0, 1.0, *[_HELD_STD] * 4])
-        axes = np.kron(np.eye(2), states.world_from_rig.rotation[0])
-        covariance = axes.T @ np.diag(std**2) @ axes
-        held = PoseMeasurements(np.array([0]), states.world_from_rig[:1], covariance[None])
-        return replace(problem, poses=held)
+        held = [1.0, 1.0, *[_HELD_STD] * 4]
+        return replace(problem, poses=PoseMeasurements.of_first_state(states.world_from_rig[0], held))
     fixed = np.zeros(len(states), dtype=bool)
     fixed[0] = True
     problem = replace(problem, states=replace(states, fixed=fixed))

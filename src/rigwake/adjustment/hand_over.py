@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from rigwake.adjustment.cross_camera import find_landmarks
 from rigwake.adjustment.level import at_one_height, with_priors_of
 from rigwake.adjustment.proposals import HandOverOptions, predicted_pixels, propose_searches
-from rigwake.adjustment.rounds import MAD_TO_STD, adjust
+from rigwake.adjustment.rounds import adjust
 from rigwake.adjustment.values import AdjustedRig, AdjustmentOptions, AssembledProblem
 from rigwake.bundle.problem import Observations, RigProblem, RigSolution
+from rigwake.bundle.robust import MAD_TO_STD
 from rigwake.cameras.base import Mask
 from rigwake.recording import CameraStream
 from rigwake.tracking.masks import beyond_lens, mask_from_file

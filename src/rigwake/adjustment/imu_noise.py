@@ -9,9 +9,9 @@ import numpy as np
 from rigwake.bundle.inertial import inertial_rows
 from rigwake.bundle.layout import layout_of
 from rigwake.bundle.problem import RigProblem, RigSolution
+from rigwake.bundle.robust import MAD_TO_STD
 from rigwake.recording import ImuStream
 
-_MAD_TO_STD = 1.4826
 _FEWEST = 20  # intervals between states
 
 
@@ -26,7 +26,7 @@ def imu_noise_scales(solution: RigSolution) -> tuple[float, float]:
         return 1.0, 1.0
     residuals, _, _, covariances = inertial_rows(problem, layout_of(problem))
     whitened = np.abs(residuals) / np.sqrt(np.einsum("nii->ni", covariances))
-    turn, speed = (_MAD_TO_STD * float(np.median(whitened[:, rows])) for rows in (slice(0, 3), slice(3, 6)))
+    turn, speed = (MAD_TO_STD * float(np.median(whitened[:, rows])) for rows in (slice(0, 3), slice(3, 6)))
     return max(turn, 1.0), max(speed, 1.0)
 
 
@@ -39,8 +39,10 @@ def with_imu_noise(problem: RigProblem, scales: tuple[float, float]) -> RigProbl
     return replace(problem, imu=replace(imu, gyro_noise_density=gyro, accel_noise_density=accel))
 
 
-def imu_noise_factors(promised: ImuStream, found: ImuStream) -> dict[str, float]:
+def imu_noise_factors(promised: ImuStream | None, found: ImuStream | None) -> dict[str, float]:
     """How many times noisier than promised `gyro` and `accel` were found to be; empty where nothing was promised."""
+    if promised is None or found is None:
+        return {}
     pairs = {
         "gyro": (promised.gyro_noise_density, found.gyro_noise_density),
         "accel": (promised.accel_noise_density, found.accel_noise_density),

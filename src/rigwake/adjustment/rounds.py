@@ -10,16 +10,15 @@ import numpy as np
 from rigwake.adjustment.imu_noise import imu_noise_scales, with_imu_noise
 from rigwake.adjustment.values import AdjustedRig, AdjustmentOptions, AssembledProblem
 from rigwake.bundle.problem import Observations, RigProblem, RigSolution, SolverOptions
+from rigwake.bundle.robust import MAD_TO_STD
 from rigwake.bundle.solver import solve
 from rigwake.errors import EstimationError
 from rigwake.geometry.so3 import Array
 
-MAD_TO_STD = 1.4826
 # Damping holds back just those directions that are known least, and rounds start near their optimum
 SETTLED = SolverOptions(tolerance=1e-6, shared_tolerance=0.1, initial_damping=1e-8)
-NEARLY_SETTLED = replace(
-    SETTLED, shared_tolerance=0.5
-)  # what is dropped next does not depend on the last digits
+# what is dropped next does not depend on the last digits
+NEARLY_SETTLED = replace(SETTLED, shared_tolerance=0.5)
 _FIRST_GATE = 3.0  # the first round's gate is wider by this factor: the start is still in the residuals
 _MIN_LANDMARKS = 20
 _NEAREST_INVERSE = 1e4  # 1 / units: what is nearer than a tenth of a millimetre is no landmark
@@ -38,8 +37,7 @@ def adjust(
 
     Between rounds an observation beyond the gate is dropped, landmarks left with too few observations go, and
     each camera's `std_px` is scaled to the spread that its residuals show; so are the IMU's densities where
-    its residuals exceed them. Raises EstimationError when too few
-    landmarks are left.
+    its residuals exceed them. Raises EstimationError when too few landmarks are left.
     """
     problem = assembled.problem
     cameras, ids = assembled.track_cameras, assembled.track_ids

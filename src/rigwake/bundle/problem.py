@@ -217,6 +217,14 @@ class PoseMeasurements:
     world_from_rig: SE3
     covariances: Array
 
+    @classmethod
+    def of_first_state(cls, world_from_rig: SE3, std: ArrayLike) -> PoseMeasurements:
+        """The first state held where it is, with six standard deviations about and along the axes of the world."""
+        axes = np.kron(np.eye(2), world_from_rig.rotation)
+        covariance = axes.T @ np.diag(np.asarray(std, dtype=np.float64) ** 2) @ axes
+        held = SE3(world_from_rig.rotation[None], world_from_rig.translation[None])
+        return cls(np.array([0]), held, covariance[None])
+
 
 @dataclass(frozen=True, eq=False)
 class RelativeMeasurements:

@@ -25,6 +25,7 @@ from rigwake.bundle.problem import (
     SolverOptions,
     States,
 )
+from rigwake.bundle.robust import MAD_TO_STD
 from rigwake.bundle.solver import solve
 from rigwake.cameras.base import CameraModel
 from rigwake.errors import EstimationError
@@ -232,14 +233,10 @@ def _chosen_fixes(gnss: GnssStream | None, used: Array | None) -> GnssStream | N
 
 def _level_gauge(first: SE3, *, holds_heading: bool) -> PoseMeasurements:
     """Holds position and, unless something measures it, heading of the first state."""
-    axes = np.kron(np.eye(2), first.rotation)
     std = _GAUGE_STD.copy()
     if not holds_heading:
         std[2] = std[0]
-    covariance = axes.T @ np.diag(std**2) @ axes
-    return PoseMeasurements(
-        np.array([0]), SE3(first.rotation[None], first.translation[None]), covariance[None]
-    )
+    return PoseMeasurements.of_first_state(first, std)
 
 
 def _reweighted(rough: RigSolution) -> tuple[RigProblem, float]:
@@ -247,7 +244,7 @@ def _reweighted(rough: RigSolution) -> tuple[RigProblem, float]:
     observations = rough.problem.observations
     whitened = rough.residuals_px / observations.std_px[:, None]
     valid = np.isfinite(whitened).all(axis=1)
-    factor = max(1.4826 * float(np.median(np.abs(whitened[valid]))), 1e-3)
+    factor = max(MAD_TO_STD * float(np.median(np.abs(whitened[valid]))), 1e-3)
     kept = valid & (np.linalg.norm(np.nan_to_num(whitened), axis=1) <= _GATE_STDS * factor)
     counts = np.bincount(observations.landmark_indices[kept], minlength=len(rough.problem.landmarks))
     kept &= counts[observations.landmark_indices] >= _MIN_VIEWS

@@ -35,10 +35,8 @@ from rigwake.geometry.so3 import Array
 from rigwake.readers.truth import read_yaml_mapping
 from rigwake.trajectory import Trajectory
 
-_ABOARD_STD_M = (
-    10.0  # as good as nothing, yet it keeps an offset that nothing determines from running away, and
-)
-# with it whatever that offset draws along
+# as good as nothing, yet it keeps an offset that nothing determines, and whatever it draws along, from running away
+_ABOARD_STD_M = 10.0
 _FIXED_STD = 1e-7  # radians or metres: what a fixed degree of freedom is held with
 
 

@@ -20,7 +20,6 @@ from rigwake.adjustment.start import FirstRig, first_rig
 from rigwake.adjustment.values import AdjustedRig, RigMeasurements
 from rigwake.adjustment.verdicts import ReferenceFrame, calibrated_cameras
 from rigwake.bundle.covariance import covariance_of
-from rigwake.bundle.problem import RigProblem
 from rigwake.calibration import Calibration
 from rigwake.config import CalibrateConfig
 from rigwake.errors import InputError, UnobservableError
@@ -145,14 +144,8 @@ def _conclude(
         hand_over=hand_over_errors(solution, handed_over.unused),
         scale_source=first.scale_source,
         converged=solution.report.converged,
-        imu_noise_factors=_imu_noise(selection, solution.problem),
+        imu_noise_factors=imu_noise_factors(selection.imu, solution.problem.imu),
     )
-
-
-def _imu_noise(selection: Selection, problem: RigProblem) -> dict[str, float]:
-    if selection.imu is None or problem.imu is None:
-        return {}
-    return imu_noise_factors(selection.imu, problem.imu)
 
 
 def reference_frame(
