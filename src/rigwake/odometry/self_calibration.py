@@ -44,6 +44,9 @@ _MAX_ROUNDS = 4
 _MIN_VIEWS = 3
 _HELD_STD = 1e-9
 _SOLVER = SolverOptions(loss="cauchy", loss_scale=2.0, tolerance=1e-5, max_iterations=20)
+_LENS_SOLVER = replace(
+    _SOLVER, tolerance=1e-7, max_iterations=60
+)  # centre and decentring creep along a valley
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +74,8 @@ def estimate_refining_lens(
     visual, lens = estimate(tracks, camera), None
     for _ in range(_MAX_ROUNDS):
         now = (tracks, camera) if lens is None else (lens.tracks, lens.camera)
-        better = refine_lens(*now, visual, min_gain=_MIN_GAIN if lens is None else _MIN_LATER_GAIN)
+        min_gain = _MIN_GAIN if lens is None else _MIN_LATER_GAIN
+        better = refine_lens(*now, visual, believed=camera, min_gain=min_gain)
         if better is None:
             break
         gain = better.gain if lens is None else 1 - (1 - lens.gain) * (1 - better.gain)
@@ -81,19 +85,25 @@ def estimate_refining_lens(
 
 
 def refine_lens(
-    tracks: Tracks, camera: CameraModel, visual: OdometryResult, *, min_gain: float = _MIN_GAIN
+    tracks: Tracks,
+    camera: CameraModel,
+    visual: OdometryResult,
+    *,
+    believed: CameraModel | None = None,
+    min_gain: float = _MIN_GAIN,
 ) -> RefinedLens | None:
     """Distortion and principal point estimated with motion and points of the longest segment.
 
     None where that lowers the adjustment's cost by less than `min_gain`, or where it cannot be estimated.
-    Every free parameter has a prior: alone, it moves the observed pixels by one (root mean square).
+    Every free parameter has a prior about the lens `believed` (`camera`, unless given): alone, it moves the observed
+    pixels by one (root mean square).
     """
     problem = _problem(tracks, camera, visual)
     if problem is None:
         return None
     try:
         held = solve(problem, _SOLVER).report.final_cost
-        solution = solve(_with_free_lens(problem), _SOLVER)
+        solution = solve(_with_free_lens(problem, believed or camera), _LENS_SOLVER)
         refined = solution.problem.cameras[0].model
         bearings, seen = refined.unproject(tracks.pixels)
     except RigwakeError:  # a lens beyond its bounds, or too little to adjust: the one given stays
@@ -154,8 +164,8 @@ def _problem(tracks: Tracks, camera: CameraModel, visual: OdometryResult) -> Rig
     )
 
 
-def _with_free_lens(problem: RigProblem) -> RigProblem:
-    """The same with distortion and principal point free, each as sure as one pixel."""
+def _with_free_lens(problem: RigProblem, believed: CameraModel) -> RigProblem:
+    """The same with distortion and principal point free, each believed to be as in `believed` within one pixel."""
     camera = problem.cameras[0]
     lens = camera.model
     bearings, seen = lens.unproject(problem.observations.pixels)
@@ -168,7 +178,7 @@ def _with_free_lens(problem: RigProblem) -> RigProblem:
             for name, px in zip(lens.param_names, px_per_unit, strict=True)
         ]
     )
-    prior = VectorPrior.from_std(lens.params, std)
+    prior = VectorPrior.from_std(believed.params, std)
     return replace(
         problem, cameras=(replace(camera, free=frozenset({"intrinsics"}), intrinsics_prior=prior),)
     )
