@@ -57,13 +57,13 @@ def test_klt_lands_on_projected_truth_through_vignetting_and_exposure(hard_scene
     for low, high in ((0, 40), (40, 65), (65, 92)):
         zone = inliers & (angle >= low) & (angle < high)
         assert zone.sum() > 100
-        assert np.linalg.norm(error[zone].mean(axis=0)) < 0.03
+        assert np.linalg.norm(error[zone].mean(axis=0)) < 0.008
 
 
 def test_predicted_deviations_are_honest(hard_scene, hard_tracks):
     error, later = errors_px(hard_scene, hard_tracks)
     score = (error[later] ** 2).sum(axis=1) / 2 / hard_tracks.std_px[later] ** 2
-    assert 0.3 < np.median(score) / np.log(2) < 3.0  # the median of a chi-square of two, halved, is ln 2
+    assert 0.5 < np.median(score) / np.log(2) < 2.0  # the median of a chi-square of two, halved, is ln 2
 
 
 def test_tracks_survive_for_long(hard_tracks):

@@ -18,7 +18,7 @@ from rigwake.bundle.threads import over_ranges
 from rigwake.geometry.so3 import Array
 from rigwake.recording import CameraStream
 from rigwake.tracking.interpolation import Coefficients, spline_coefficients
-from rigwake.tracking.registration import PatchShape, References, make_references, register
+from rigwake.tracking.registration import PatchShape, References, drawn_by_bend, make_references, register
 
 _REACH_PX = 2.5  # what one registration can bridge
 
@@ -43,7 +43,7 @@ def find_landmarks(
             wanted[rows[here]] = True
             own, patches = searches.take(wanted), references.take(wanted)
             pixels[wanted], std_px[wanted] = _look_around(coefficients, patches, shape, own, options)
-            pixels[wanted] -= drawn_by_bend(patches, shape, own.warps, own.bends)
+            pixels[wanted] -= drawn_by_bend(patches, own.warps, own.bends)
 
     _each_camera(problem, streams, look)
     agreed = np.flatnonzero(np.isfinite(std_px))
@@ -143,23 +143,3 @@ def _look_around(
 
 def _rings(options: HandOverOptions) -> int:
     return max(int(np.ceil(options.search_px / _REACH_PX - 0.5)), 0)
-
-
-def drawn_by_bend(references: References, shape: PatchShape, warps: Array, bends: Array) -> Array:
-    """(N, 2) how far patches are found from where they are, because their warp is bent and an affine one is fitted.
-
-    Perspective and lens move the sample at offset x from the patch's centre by `A x + b(x)`, b being quadratic with
-    the second derivatives `bends` (N, 2, 3). In the patch's own pixels that is `A^-1 b(x)`; with G the slopes of the
-    samples by position and warp, the fit answers with `(G^T G)^-1 G^T g`, g what `A^-1 b` does to the samples.
-    A tenth of a pixel between cameras that look 90 degrees apart, in the same sense for all of them.
-    """
-    x, y = shape.offsets.T.astype(np.float64)
-    quadratic = np.stack([x * x / 2, x * y, y * y / 2])
-    moved = np.linalg.inv(warps) @ bends @ quadratic
-    n_unknowns = references.information.shape[1]
-    slopes = references.pattern[:, :n_unknowns].astype(np.float64)
-    changed = np.einsum("nik,nik->nk", slopes[:, :2], moved)
-    right = np.einsum("nik,nk->ni", slopes, changed)
-    ridge = 1e-9 * np.einsum("nii->n", references.information)[:, None, None] * np.eye(n_unknowns)
-    fitted = np.linalg.solve(references.information + ridge, right[:, :, None])
-    return np.asarray((warps @ fitted[:, :2])[:, :, 0])

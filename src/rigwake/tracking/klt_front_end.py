@@ -16,7 +16,7 @@ from rigwake.tracking.interpolation import Coefficients, spline_coefficients
 from rigwake.tracking.klt import follow
 from rigwake.tracking.masks import inside
 from rigwake.tracking.options import TrackingOptions
-from rigwake.tracking.registration import PatchShape, References, make_references, register
+from rigwake.tracking.registration import PatchShape, References, drawn_by_bend, make_references, register
 from rigwake.tracking.warps import dominant_rotation, rotation_warps, stencil_bearings
 
 Observed = tuple[NDArray[np.int64], Array, Array]
@@ -114,7 +114,7 @@ class KltFrontEnd:
         kept = believed & valid
         live, predicted, bearings = live.take(kept), predicted[kept], bearings[kept]
         turned = dominant_rotation(live.bearings, bearings) @ live.image_from_reference
-        turns, valid = rotation_warps(self.model, live.stencils, turned, bearings)
+        turns, bends, valid = rotation_warps(self.model, live.stencils, turned, bearings)
         seen = register(
             coefficients,
             live.references,
@@ -126,14 +126,15 @@ class KltFrontEnd:
         )
         if seen.found.any():
             self.noise = float(np.median(seen.noise[seen.found]))
-        bearings, on_lens = self.model.unproject(seen.pixels)
+        pixels = seen.pixels - drawn_by_bend(live.references, seen.warps, bends)
+        bearings, on_lens = self.model.unproject(pixels)
         stretch = np.linalg.svd(seen.warps, compute_uv=False)
-        kept = valid & on_lens & seen.found & inside(usable, seen.pixels)
+        kept = valid & on_lens & seen.found & inside(usable, pixels)
         kept &= (seen.correlation >= options.min_correlation) & (seen.std_px <= options.max_std_px)
         kept &= (stretch[:, 0] <= options.max_stretch) & (stretch[:, 1] >= 1 / options.max_stretch)
         now = _Live(
             live.ids,
-            seen.pixels,
+            pixels,
             bearings,
             seen.std_px,
             seen.warps,

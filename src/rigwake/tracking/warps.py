@@ -14,7 +14,7 @@ from rigwake.geometry import so3
 from rigwake.geometry.so3 import Array
 
 _STENCIL_PX = 2.0
-_STENCIL = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]]) * _STENCIL_PX
+_STENCIL = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [0, 0]]) * _STENCIL_PX
 _MIN_ANGLE = 1e-4  # scale of the robust loss: about a fiftieth of a pixel of a wide lens
 
 
@@ -36,30 +36,40 @@ def dominant_rotation(bearings_before: Array, bearings_after: Array) -> Array:
 
 
 def stencil_bearings(model: CameraModel, pixels: Array) -> tuple[Array, Mask]:
-    """Bearings (N, 4, 3) of the pixels 2 px right, left, below and above each pixel (N, 2), and validity (N,)."""
+    """Bearings (N, 7, 3) of pixels (N, 2) and of six pixels about each of them, and validity (N,).
+
+    These are 2 px to the right, left, below and above, on the diagonal to the lower right and upper left, and the
+    pixel itself.
+    """
+    n_points = len(_STENCIL)
     bearings, valid = model.unproject((pixels[:, None] + _STENCIL).reshape(-1, 2))
-    return bearings.reshape(-1, 4, 3), np.asarray(valid.reshape(-1, 4).all(axis=1))
+    return bearings.reshape(-1, n_points, 3), np.asarray(valid.reshape(-1, n_points).all(axis=1))
 
 
 def rotation_warps(
     model: CameraModel, reference_stencils: Array, after_from_reference: Array, bearings_after: Array
-) -> tuple[Array, Mask]:
-    """Affine warps (N, 2, 2) of patches by the turn of the camera, and validity (N,).
+) -> tuple[Array, Array, Mask]:
+    """Warps of patches by the turn of the camera: affine (N, 2, 2), their bends (N, 2, 3), and validity (N,).
 
-    reference_stencils: (N, 4, 3) from `stencil_bearings` in the reference frames. after_from_reference:
+    reference_stencils: (N, 7, 3) from `stencil_bearings` in the reference frames. after_from_reference:
     (N, 3, 3) rotation of the camera since then. bearings_after: (N, 3) where the patch is now: what parallax
-    has added to the turn is taken as the smallest rotation that explains it.
+    has added to the turn is taken as the smallest rotation that explains it. The bends are the second derivatives of
+    the pixel by that in the reference: xx, xy, yy.
     """
-    stencils = np.einsum("nij,nkj->nki", after_from_reference, reference_stencils)
-    centres = stencils.sum(axis=1)
-    centres /= np.linalg.norm(centres, axis=1, keepdims=True)
-    stencils = np.einsum("nij,nkj->nki", _smallest_rotation(centres, bearings_after), stencils)
+    centres = np.einsum("nij,nj->ni", after_from_reference, reference_stencils[:, -1])
+    turned = _smallest_rotation(centres, bearings_after) @ after_from_reference
+    stencils = np.einsum("nij,nkj->nki", turned, reference_stencils)
     pixels, valid = model.project(stencils.reshape(-1, 3))
-    right, left, below, above = pixels.reshape(-1, 4, 2).transpose(1, 0, 2)
+    pixels = pixels.reshape(len(stencils), -1, 2)
+    right, left, below, above, lower_right, upper_left, centre = pixels.transpose(1, 0, 2)
     warps = np.stack([right - left, below - above], axis=2) / (2 * _STENCIL_PX)
-    good = np.asarray(valid.reshape(-1, 4).all(axis=1))
+    bend_xx, bend_yy = right + left - 2 * centre, below + above - 2 * centre
+    bend_xy = (lower_right + upper_left - 2 * centre - bend_xx - bend_yy) / 2
+    bends = np.stack([bend_xx, bend_xy, bend_yy], axis=2) / _STENCIL_PX**2
+    good = np.asarray(valid.reshape(len(stencils), -1).all(axis=1))
     warps[~good] = np.eye(2)
-    return warps, good
+    bends[~good] = 0.0
+    return warps, bends, good
 
 
 def _smallest_rotation(before: Array, after: Array) -> Array:
