@@ -8,7 +8,6 @@ import numpy as np
 
 from rigwake.calibration.values import CalibratedCamera, UndeterminedDirection
 from rigwake.errors import EstimationError, UnobservableError
-from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
 from rigwake.handeye.information import USEFUL_CLOCK, USEFUL_LOG_SCALE
@@ -43,7 +42,7 @@ def calibrate_handeye(
         return _seed_result(problem, start)
     estimate = maximise(problem, start, options)
     if problem.noise == "estimated":
-        problem, estimate = without_drift(problem, estimate, reference, members, options)
+        problem, estimate = without_drift(problem, estimate, options)
     if not estimate.converged:
         raise EstimationError(
             f"Hand-eye calibration did not settle within {options.max_iterations} steps.",
@@ -69,16 +68,14 @@ def _clock(reference: Trajectory, member: Trajectory) -> float | None:
 def _result(problem: HandeyeProblem, estimate: Estimate, options: HandeyeOptions) -> HandeyeResult:
     total = covariance(problem, estimate)
     reference = problem.reference.trajectory
-    R = reference.world_from_body.rotation
-    turns = so3.log(np.swapaxes(R[:-1], -1, -2) @ R[1:])
+    turns = problem.reference.increments[:, :3]
     members, raw, scales, spread = {}, {}, {}, {}
-    start = 0
-    columns: list[int] = []
-    for m, (curve, layout) in enumerate(zip(problem.members, problem.layouts, strict=True)):
+    columns = [at.start + i for at in problem.columns for i in range(6)]
+    for m, (curve, layout, at) in enumerate(
+        zip(problem.members, problem.layouts, problem.columns, strict=True)
+    ):
         name, mounting = curve.trajectory.name, estimate.mountings[m]
-        block = total[start : start + layout.size, start : start + layout.size]
-        columns += range(start, start + 6)
-        start += layout.size
+        block = total[at, at]
         valid = estimate.valid[:, m]
         spread[name] = estimate.residuals[m][valid].std(axis=0)
         stds = np.sqrt(np.diag(block)[layout.scales])

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,11 @@ class _Motions:
     reference: SE3
     member: SE3
     segments: NDArray[np.int64]
+
+    @cached_property
+    def levers(self) -> Array:
+        """`I - R_A`: (N, 3, 3)."""
+        return np.asarray(np.eye(3) - self.reference.rotation)
 
 
 def initial_mountings(problem: HandeyeProblem, offsets_s: list[float]) -> list[Mounting]:
@@ -124,15 +130,14 @@ def _turned_about_axis(motions: _Motions, rotation: Array, turns_b: Array) -> Ar
     along = (way @ axis)[:, None] * axis
     across, quarter = way - along, way @ so3.hat(axis).T
     columns = np.stack([across, quarter, along], axis=2)
-    lever = np.eye(3) - motions.reference.rotation
-    system = np.concatenate([columns, lever], axis=2).reshape(-1, 6)
+    system = np.concatenate([columns, motions.levers], axis=2).reshape(-1, 6)
     solution = _least_squares(system, motions.reference.translation.ravel(), _lever_noise(motions, rotation))
     return so3.exp(axis * np.arctan2(solution[1], solution[0])) @ rotation
 
 
 def _with_translation(motions: _Motions, rotation: Array, layout: Layout, segments: int) -> tuple[SE3, Array]:
     """Translation and scales of a given rotation by linear least squares."""
-    lever = np.eye(3) - motions.reference.rotation
+    lever = motions.levers
     way = motions.member.translation @ rotation.T
     noise = _lever_noise(motions, rotation)
     scales = np.ones(segments)
@@ -159,8 +164,8 @@ def _lever_noise(motions: _Motions, rotation: Array) -> float:
     What the rotations of both sides disagree by tells it. Taken at its word, it would put the member hundreds
     of metres away when the vehicle does not turn.
     """
-    disagreement = motions.reference.rotation @ rotation - rotation @ motions.member.rotation
-    return float(np.linalg.norm(disagreement))
+    A, B, R = motions.reference, motions.member, np.ascontiguousarray(rotation)
+    return float(kernels.disagreement(A.rotation, B.rotation, R))
 
 
 def _least_squares(system: Array, right: Array, noise: float) -> Array:
@@ -168,7 +173,8 @@ def _least_squares(system: Array, right: Array, noise: float) -> Array:
     squares, V = np.linalg.eigh(system.T @ system)
     values = np.sqrt(np.maximum(squares, 0.0))
     kept = values > max(noise, _WEAK * float(values[-1]))
-    return np.asarray(V[:, kept] @ ((right @ system @ V[:, kept]) / squares[kept]))
+    V, squares = V[:, kept], squares[kept]
+    return np.asarray(V @ ((right @ system @ V) / squares))
 
 
 def _misfit(motions: _Motions, X: SE3, scales: Array) -> float:

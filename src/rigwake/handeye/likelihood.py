@@ -7,21 +7,24 @@ is what the agreed motions in the Jacobians of `motions` amount to.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigwake.geometry.so3 import Array
+from rigwake.handeye import normal_kernels
 from rigwake.handeye.information import (
     USEFUL_CLOCK,
     USEFUL_ROTATION,
     USEFUL_TRANSLATION,
     Equations,
+    Group,
     determined,
     doubt_of,
     form_equations,
+    group_steps,
     useful_units,
 )
 from rigwake.handeye.motions import Mounting, residuals
@@ -67,13 +70,17 @@ class _Solver:
         self.problem, self.options = problem, options
         self.covariances = step_covariances(problem, options) if problem.has_known_noise else {}
         self.filters = (Jitter(),) * len(start)
+        self.limits = _longest_step(useful_units(problem.layouts))
+        self.valid, self.groups = np.zeros((0, len(start)), dtype=bool), list[Group]()
         self.move_to(tuple(start), resample=True)
 
     def move_to(self, mountings: tuple[Mounting, ...], *, resample: bool) -> None:
         self.mountings = mountings
         if resample:
             self.steps = self.problem.steps(mountings)
-            self.valid = np.stack([s.valid for s in self.steps], axis=1)
+            valid = np.array([s.valid for s in self.steps]).T
+            if not np.array_equal(valid, self.valid):
+                self.valid, self.groups = valid, group_steps(valid)
             if self.covariances:
                 self.over_steps = self.problem.known_covariances(mountings, self.covariances)
         self.residuals = tuple(residuals(s, x) for s, x in zip(self.steps, mountings, strict=True))
@@ -86,7 +93,8 @@ class _Solver:
         if self.covariances:
             return known_noise(frames, *self.over_steps)
         filtered = [f.apply(r) for f, r in zip(self.filters, self.residuals, strict=True)]
-        return learnt_noise(frames, np.concatenate(filtered, axis=1), self.valid, self.problem.absolute)
+        stacked = filtered[0] if len(filtered) == 1 else np.concatenate(filtered, axis=1)
+        return learnt_noise(frames, stacked, self.valid, self.problem.absolute)
 
     def equations(self) -> Equations:
         return form_equations(
@@ -97,24 +105,36 @@ class _Solver:
             self.noise(),
             self.filters,
             robust=self.options.robust,
+            groups=self.groups,
         )
 
     def step(self, doubt: float) -> float:
         """One Gauss-Newton step; its length in standard deviations."""
         self.latest = self.equations()
-        tangent, moved = _bounded_step(self.latest, useful_units(self.problem.layouts), doubt)
-        ends = np.cumsum([layout.size for layout in self.problem.layouts])
-        parts = np.split(tangent, ends[:-1])
-        moves = zip(self.mountings, parts, self.problem.layouts, strict=True)
-        clocks_moved = any(
-            np.any(part[layout.clock]) for part, layout in zip(parts, self.problem.layouts, strict=True)
-        )
+        tangent, moved = _bounded_step(self.latest, self.limits, doubt)
+        parts = [tangent[columns] for columns in self.problem.columns]
+        moves = list(zip(self.mountings, parts, self.problem.layouts, strict=True))
+        clocks_moved = any(part[layout.clock].any() for _, part, layout in moves)
         self.move_to(tuple(x.retract(part, layout) for x, part, layout in moves), resample=clocks_moved)
         return moved
 
+    def estimate(self, doubt: float, iterations: int, *, converged: bool) -> Estimate:
+        """Where the solver stands."""
+        segments = np.array([s.segments for s in self.steps]).T
+        at = (self.mountings, self.latest, self.residuals, self.valid, segments, self.filters)
+        return Estimate(*at, doubt, iterations, converged)
 
-def maximise(problem: HandeyeProblem, start: Sequence[Mounting], options: HandeyeOptions) -> Estimate:
-    """Gauss-Newton from `start` until a step moves nothing by more than a thousandth of its deviation."""
+
+def maximise(
+    problem: HandeyeProblem,
+    start: Sequence[Mounting],
+    options: HandeyeOptions,
+    worthwhile: Callable[[Estimate], bool] | None = None,
+) -> Estimate:
+    """Gauss-Newton from `start` until a step moves nothing by more than a thousandth of its deviation.
+
+    worthwhile: asked once, when steps are down to 0.3 deviations; unless it is, the estimate is left there.
+    """
     solver = _Solver(problem, start, options)
     learning = problem.noise == "estimated"
     doubt = doubt_of(problem, int(solver.valid.any(axis=1).sum()))
@@ -125,21 +145,18 @@ def maximise(problem: HandeyeProblem, start: Sequence[Mounting], options: Handey
             settled = True
         moved = solver.step(doubt)
         iterations += 1
+        if worthwhile is not None and moved < _SETTLED:
+            so_far = solver.estimate(doubt, iterations, converged=moved <= enough)
+            if not worthwhile(so_far):
+                return so_far
+            worthwhile = None
         if iterations % _PATIENCE == 0:
             # what comes and goes with every step is on the edge: a direction of being determined (give it
             # up), a pose of the shared time (it moves the estimate by little)
             doubt, enough = 2 * doubt, 10 * enough
-    return Estimate(
-        solver.mountings,
-        solver.latest if moved <= enough else solver.equations(),
-        solver.residuals,
-        solver.valid,
-        np.stack([s.segments for s in solver.steps], axis=1),
-        solver.filters,
-        doubt,
-        iterations,
-        moved <= enough,
-    )
+    if moved > enough:
+        solver.latest = solver.equations()
+    return solver.estimate(doubt, iterations, converged=moved <= enough)
 
 
 def information_criterion(problem: HandeyeProblem, estimate: Estimate) -> float:
@@ -153,24 +170,25 @@ def information_criterion(problem: HandeyeProblem, estimate: Estimate) -> float:
         zip(problem.layouts, estimate.filters, estimate.residuals, strict=True)
     ):
         valid = estimate.valid[:, m]
-        predicted = jitter.apply(r)[valid]
-        levels = [robust_mean_square(part) for part in (predicted[:, :3], predicted[:, 3:])]
-        total += 3 * len(predicted) * float(np.sum(np.log(levels)))
-        total += layout.size * np.log(max(len(predicted), 1))
+        predicted, count = jitter.apply(r), int(valid.sum())
+        levels = [robust_mean_square(predicted, valid, first) for first in (0, 3)]
+        total += 3 * count * float(np.sum(np.log(levels)))
+        total += layout.size * np.log(max(count, 1))
     return total
 
 
-def _bounded_step(equations: Equations, units: Array, doubt: float) -> tuple[Array, float]:
-    """The Gauss-Newton step along what is determined, and its length in standard deviations.
-
-    Along the rest the likelihood follows the noise, often towards infinity; it stays where it started.
-    """
-    basis = determined(equations, units, doubt).basis
-    coefficients = -(basis.T @ equations.scores.sum(axis=0))
-    step = basis @ coefficients
+def _longest_step(units: Array) -> Array:
     limits = np.full(len(units), np.inf)
     limits[units == USEFUL_ROTATION] = _LONGEST_TURN
     limits[units == USEFUL_TRANSLATION] = _LONGEST_WAY
     limits[units == USEFUL_CLOCK] = USEFUL_CLOCK
-    shorten = min(1.0, float(np.min(limits / np.maximum(np.abs(step), 1e-300))))
-    return step * shorten, float(np.linalg.norm(coefficients))
+    return limits
+
+
+def _bounded_step(equations: Equations, limits: Array, doubt: float) -> tuple[Array, float]:
+    """The Gauss-Newton step along what is determined, and its length in standard deviations.
+
+    Along the rest the likelihood follows the noise, often towards infinity; it stays where it started.
+    """
+    basis = determined(equations, doubt).basis
+    return normal_kernels.bounded_step(basis, equations.scores, limits)

@@ -17,13 +17,14 @@ error is then independent of r (profile likelihood over the true motions).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
-from rigwake.handeye import kernels
+from rigwake.handeye import kernels, normal_kernels
 from rigwake.handeye.resample import Sampled
 
 
@@ -43,13 +44,18 @@ class Mounting:
         """The unknowns after a step in the order of `layout`."""
         worlds = self.worlds
         if worlds is not None:
-            worlds = worlds.retract(step[layout.worlds].reshape(-1, 6))
+            worlds = retracted(worlds, step[layout.worlds].reshape(-1, 6))
         clock = float(step[layout.clock].sum())
         log_scales = self.log_scales.copy()
         log_scales[: layout.scale_count] += step[layout.scales]
-        return Mounting(
-            self.ref_from_member.retract(step[:6]), worlds, self.time_offset_s + clock, log_scales
-        )
+        X = retracted(self.ref_from_member[None], step[None, :6])[0]
+        return Mounting(X, worlds, self.time_offset_s + clock, log_scales)
+
+
+def retracted(transforms: SE3, deltas: Array) -> SE3:
+    """`transforms.retract(deltas)`, compiled, for N transforms."""
+    parts = (transforms.rotation, transforms.translation, deltas)
+    return SE3(*kernels.retracted(*(np.ascontiguousarray(part) for part in parts)))
 
 
 @dataclass(frozen=True)
@@ -60,22 +66,22 @@ class Layout:
     has_clock: bool
     scale_count: int
 
-    @property
+    @cached_property
     def worlds(self) -> slice:
         """Six columns per world gauge."""
         return slice(6, 6 + 6 * self.world_count)
 
-    @property
+    @cached_property
     def clock(self) -> slice:
         """The time offset, if estimated."""
         return slice(self.worlds.stop, self.worlds.stop + self.has_clock)
 
-    @property
+    @cached_property
     def scales(self) -> slice:
         """One logarithm of a scale per segment, if estimated."""
         return slice(self.clock.stop, self.clock.stop + self.scale_count)
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Number of unknowns."""
         return self.scales.stop
@@ -175,10 +181,10 @@ def linearise(steps: Steps, mounting: Mounting, layout: Layout, reference_errors
 
 
 def _frames(mounting: Mounting) -> tuple[Array, Array, Array, Array]:
-    """Y^-1 of every segment (or the one for all) and X, as contiguous rotations and translations."""
+    """Y of every segment (or the one for all) and X, as contiguous rotations and translations."""
     X = mounting.ref_from_member
-    inverse = (X[None] if mounting.worlds is None else mounting.worlds).inverse()
-    parts = (inverse.rotation, inverse.translation, X.rotation, X.translation)
+    Y = X[None] if mounting.worlds is None else mounting.worlds
+    parts = (Y.rotation, Y.translation, X.rotation, X.translation)
     R, t, R_X, t_X = (np.ascontiguousarray(part) for part in parts)
     return R, t, R_X, t_X
 
@@ -198,14 +204,14 @@ def feigned_information(
     """
     thinned = slice(None, None, max(1, len(chosen) // 100))
     some = chosen[thinned]
-    covariance, W = (x if len(x) == 1 else x[thinned] for x in (errors, weights))
-    values, vectors = np.linalg.eigh(covariance)
-    total = kernels.feigned(
-        vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :],
-        np.ascontiguousarray(W),
-        linear.adjoints[some],
-        linear.ways[some],
-        steps.segments[some],
+    covariances, W = (np.ascontiguousarray(x if len(x) == 1 else x[thinned]) for x in (errors, weights))
+    total = normal_kernels.feigned(
+        covariances,
+        W,
+        linear.adjoints,
+        linear.ways,
+        steps.segments,
+        np.ascontiguousarray(some),
         layout.world_count,
         layout.scales.start,
         layout.size,

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array, hat
-from rigwake.handeye import kernels
+from rigwake.geometry.so3 import Array
+from rigwake.handeye import noise_kernels, normal_kernels
 from rigwake.handeye.resample import Curve
 
 ROTATION_FLOOR = 1e-9  # rad; nothing is known better than rounding allows
@@ -36,14 +36,14 @@ class StepNoise:
 
     def restricted(self, chosen: NDArray[np.int64], rows: NDArray[np.int64]) -> StepNoise:
         """For the steps `chosen` and the members whose stacked rows are `rows`."""
+        if len(self.total) == 1 and len(rows) == self.total.shape[1]:
+            return self
         pick = np.ix_(np.arange(1) if len(self.total) == 1 else chosen, rows, rows)
         return StepNoise(self.total[pick], self.of_reference[pick])
 
-    def inverse(self) -> Array:
-        """S^-1, after scaling to unit diagonal (rotation and translation differ by many decades)."""
-        scale = 1 / np.sqrt(np.einsum("nii->ni", self.total))
-        normalised = self.total * scale[:, :, None] * scale[:, None, :]
-        return np.asarray(np.linalg.inv(normalised) * scale[:, :, None] * scale[:, None, :])
+    def inverse(self) -> tuple[Array, Array, Array]:
+        """S^-1; Sa S^-1, the share of a residual that is the reference's; what that leaves of Sa."""
+        return normal_kernels.inverted(self.total, self.of_reference)
 
 
 def known_noise(mountings: Sequence[SE3], reference: Array, members: Sequence[Array]) -> StepNoise:
@@ -52,16 +52,8 @@ def known_noise(mountings: Sequence[SE3], reference: Array, members: Sequence[Ar
     The products of both rotation errors with the lever arm are of second order, but without them exact
     translations beside noisy rotations would be believed beyond what the first order is true to.
     """
-    stacked = np.concatenate([X.inverse().adjoint() for X in mountings], axis=0)  # (6 M, 6)
-    of_reference = stacked @ (reference + np.diag(FLOOR)) @ stacked.T
-    total = of_reference.copy()
-    for m, covariance in enumerate(members):
-        block = slice(6 * m, 6 * m + 6)
-        total[:, block, block] += covariance + np.diag(FLOOR)
-        both = np.trace(reference[:, :3, :3] + covariance[:, :3, :3], axis1=1, axis2=2) / 3
-        arm = float(np.sum(mountings[m].translation ** 2))
-        total[:, range(6 * m + 3, 6 * m + 6), range(6 * m + 3, 6 * m + 6)] += (both**2 * arm / 8)[:, None]
-    return StepNoise(total, of_reference)
+    R, t = np.array([X.rotation for X in mountings]), np.array([X.translation for X in mountings])
+    return StepNoise(*noise_kernels.propagated(R, t, reference, np.stack(members), FLOOR))
 
 
 def learnt_noise(
@@ -75,45 +67,36 @@ def learnt_noise(
     would take them for noise and bend the estimate after them. One member cannot tell whose error it is:
     then both sides are equally noisy.
     """
-    count = len(mountings)
-    rotation, translation = [], []
-    for m, X in enumerate(mountings):
-        r = residuals[known[:, m], 6 * m : 6 * m + 6]
-        turned = _robust_covariance(r[:, :3], by_axis)
-        # an error of the reference's rotation moves the member by the lever arm
-        arm = hat(X.inverse().translation)
-        moved = _robust_covariance(r[:, 3:], by_axis) - arm @ turned @ arm.T / 2
-        rotation.append(turned)
-        translation.append(_positive(moved) if by_axis else _positive_level(moved) * np.eye(3))
-    members = [np.zeros((1, 6, 6)) for _ in range(count)]
-    reference = np.zeros((1, 6, 6))
-    for first, found in ((0, rotation), (3, translation)):
-        shares = _shares_of_reference(residuals, known, mountings, first)
-        block = slice(first, first + 3)
-        for m, X in enumerate(mountings):
-            members[m][0, block, block] = (1 - shares[m]) * found[m]
-            reference[0, block, block] += shares[m] / count * (X.rotation @ found[m] @ X.rotation.T)
-    return known_noise(mountings, reference, members)
+    R, t = np.array([X.rotation for X in mountings]), np.array([X.translation for X in mountings])
+    found = noise_kernels.learnt_covariances(
+        R, t, residuals, known, by_axis, ROTATION_FLOOR**2, _CHI2_MEDIAN, _CHI2_LIMIT
+    )
+    found[:, 1] = _positive(found[:, 1]) if by_axis else _positive_levels(found[:, 1])
+    shares = np.array([_shares_of_reference(residuals, known, mountings, first) for first in (0, 3)])
+    return StepNoise(*noise_kernels.propagated(R, t, *noise_kernels.split(R, found, shares), FLOOR))
 
 
-def _positive_level(covariance: Array) -> float:
-    """Mean variance of (3, 3), not below what rounding allows."""
-    return max(float(np.trace(covariance)) / 3, 0.0) + TRANSLATION_FLOOR**2
+def _positive_levels(covariances: Array) -> Array:
+    """Mean variances of (M, 3, 3), not below what rounding allows, on the diagonal."""
+    levels = np.maximum(np.einsum("mii->m", covariances) / 3, 0.0) + TRANSLATION_FLOOR**2
+    return np.asarray(levels[:, None, None] * np.eye(3))
 
 
-def _positive(covariance: Array) -> Array:
-    """(3, 3) with no direction below a twentieth of the widest."""
-    values, vectors = np.linalg.eigh(covariance)
-    kept = np.maximum(values, 0.05 * max(values[-1], 0.0) + TRANSLATION_FLOOR**2)
-    return np.asarray((vectors * kept) @ vectors.T)
+def _positive(covariances: Array) -> Array:
+    """(M, 3, 3) with no direction below a twentieth of the widest."""
+    values, vectors = np.linalg.eigh(covariances)
+    kept = np.maximum(values, 0.05 * np.maximum(values[:, 2:], 0.0) + TRANSLATION_FLOOR**2)
+    return np.asarray((vectors * kept[:, None, :]) @ np.swapaxes(vectors, -1, -2))
 
 
 def _shares_of_reference(
     residuals: Array, known: NDArray[np.bool_], mountings: Sequence[SE3], first: int
 ) -> Array:
     """How much of every member's variance (three rows from `first`) is the reference's: what two share."""
+    if len(mountings) == 1:
+        return np.full(1, 0.5)
     axes = [residuals[:, 6 * m + first : 6 * m + first + 3] @ X.rotation.T for m, X in enumerate(mountings)]
-    own = [_robust_mean(np.sum(r[known[:, m]] ** 2, axis=1)) for m, r in enumerate(axes)]
+    own = [_robust_mean(r, known[:, m]) for m, r in enumerate(axes)]
     shared = [
         float(np.mean(np.sum((r * other)[known[:, m] & known[:, n]], axis=1)))
         for m, r in enumerate(axes)
@@ -125,37 +108,21 @@ def _shares_of_reference(
     return np.clip(np.mean(shared) / np.maximum(own, 1e-300), 0.1, 0.9)
 
 
-def _robust_covariance(rows: Array, by_axis: bool) -> Array:
-    """Covariance (3, 3) about zero with outliers pulled in (Huber's proposal 2)."""
-    floor = ROTATION_FLOOR**2 * np.eye(3)
-    covariance = _robust_mean(np.sum(rows**2, axis=1)) / 3 * np.eye(3) + floor
-    if not by_axis:
-        return np.asarray(covariance)
-    for _ in range(2):
-        squared = np.einsum("ni,ij,nj->n", rows, np.linalg.inv(covariance), rows)
-        pulled = rows * np.sqrt(np.minimum(1.0, _CHI2_LIMIT / np.maximum(squared, 1e-300)))[:, None]
-        covariance = pulled.T @ pulled / max(len(rows), 1) + floor
-    return np.asarray(covariance)
+def _robust_mean(rows: Array, known: NDArray[np.bool_], first: int = 0) -> float:
+    """Mean of `|r|^2` (three Gaussian columns from `first` on) with the outliers pulled in: starts from the median."""
+    squared = noise_kernels.squared_lengths(rows, known, first)
+    return float(noise_kernels.robust_mean(squared, _CHI2_MEDIAN, _CHI2_LIMIT))
 
 
-def _robust_mean(squared_lengths: Array) -> float:
-    """Mean of `|r|^2` (three Gaussian rows) with the outliers pulled in: starts from the median."""
-    return float(kernels.robust_mean(squared_lengths, _CHI2_MEDIAN, _CHI2_LIMIT))
-
-
-def robust_mean_square(rows: Array) -> float:
-    """Mean of `|r|^2` of rows (N, 3), outliers pulled in, never below what rounding allows."""
-    return _robust_mean(np.sum(rows**2, axis=1)) + ROTATION_FLOOR**2
+def robust_mean_square(rows: Array, known: NDArray[np.bool_], first: int) -> float:
+    """Mean of `|r|^2` of three columns of the known rows, outliers pulled in, never below what rounding allows."""
+    return _robust_mean(rows, known, first) + ROTATION_FLOOR**2
 
 
 @cache
-def _outlier_limit(dimension: int) -> float:
+def outlier_limit(dimension: int) -> float:
+    """Squared length that one in a thousand Gaussian vectors exceeds: Huber weights fall off from there."""
     return float(chi2.ppf(1 - OUTLIER_PROBABILITY, dimension))
-
-
-def robust_weights(squared: Array, dimension: int) -> Array:
-    """Huber weights that touch one in a thousand steps of Gaussian noise."""
-    return np.asarray(np.sqrt(np.minimum(1.0, _outlier_limit(dimension) / np.maximum(squared, 1e-300))))
 
 
 @dataclass(frozen=True)
@@ -175,7 +142,7 @@ class Jitter:
         if self.rotation == 0 and self.translation == 0:
             return rows
         cells = np.ascontiguousarray(rows).reshape(len(rows), 6, -1)
-        return kernels.innovations(cells, self.rotation, self.translation).reshape(rows.shape)
+        return noise_kernels.innovations(cells, self.rotation, self.translation).reshape(rows.shape)
 
 
 _ENOUGH_STEPS = 20_000
@@ -190,17 +157,9 @@ def fit_jitter(residuals: Array, valid: NDArray[np.bool_]) -> Jitter:
     """
     residuals, valid = residuals[:_ENOUGH_STEPS], valid[:_ENOUGH_STEPS]
     thetas = [theta for theta in _THETAS if theta <= max(0.0, 1 - 10 / max(valid.sum(), 1))]
-    cells, best = np.ascontiguousarray(residuals)[:, :, None], []
-    errors = np.array([_squared_innovations(cells, theta)[valid] for theta in thetas])
-    for part in range(2):
-        means = [_robust_mean(np.ascontiguousarray(squared[:, part])) for squared in errors]
-        best.append(thetas[int(np.argmin(means))])
-    return Jitter(*best)
-
-
-def _squared_innovations(cells: Array, theta: float) -> Array:
-    """(N, 2) squared lengths of rotation and translation."""
-    return np.asarray((kernels.innovations(cells, theta, theta) ** 2).reshape(-1, 2, 3).sum(axis=2))
+    errors = noise_kernels.prediction_errors(residuals, valid, np.array(thetas), _CHI2_MEDIAN, _CHI2_LIMIT)
+    rotation, translation = np.argmin(errors, axis=1)
+    return Jitter(thetas[rotation], thetas[translation])
 
 
 def noise_over_steps(covariances: Array, curve: Curve, times_s: Array, absolute: bool) -> Array:

@@ -41,13 +41,13 @@ def covariance(problem: HandeyeProblem, estimate: Estimate) -> Array:
     """
     equations = estimate.equations
     units = useful_units(problem.layouts)
-    split = determined(equations, units, estimate.doubt)
+    split = determined(equations, estimate.doubt)
     middle = np.eye(len(split.genuine))
     if not problem.has_known_noise:
         values, vectors = np.linalg.eigh(split.basis.T @ _scatter(equations) @ split.basis)
         middle = (vectors * np.maximum(values, _memory(estimate) if problem.absolute else 1.0)) @ vectors.T
     outer = split.basis / split.genuine
-    far = _OPEN_UNITS * split.open
+    far = _OPEN_UNITS * split.open(units)
     whole = outer @ middle @ outer.T + far @ far.T
     # rounding beside the large open directions: keeps every later change of axes positive definite
     scaled = np.trace(whole / (units[:, None] * units[None, :]))
@@ -56,7 +56,9 @@ def covariance(problem: HandeyeProblem, estimate: Estimate) -> Array:
 
 def _scatter(equations: Equations) -> Array:
     scores = equations.scores[equations.used]
-    blocks = np.array([part.sum(axis=0) for part in np.array_split(scores, min(_BLOCKS, len(scores)))])
+    count = min(_BLOCKS, len(scores))
+    size, longer = divmod(len(scores), count)
+    blocks = np.add.reduceat(scores, np.arange(count) * size + np.minimum(np.arange(count), longer))
     return np.asarray(blocks.T @ blocks * (len(blocks) / max(len(blocks) - 1, 1)))
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -34,6 +36,12 @@ class HandeyeProblem:
     def absolute(self) -> bool:
         """Whether poses are compared, not increments."""
         return self.noise == "poses"
+
+    @cached_property
+    def columns(self) -> list[slice]:
+        """Where the unknowns of every member stand among those of all."""
+        ends = np.cumsum([0, *(layout.size for layout in self.layouts)]).tolist()
+        return [slice(a, b) for a, b in pairwise(ends)]
 
     def times_s(self, mountings: Sequence[Mounting]) -> Array:
         """Times of the problem, seconds on the reference's clock after its first stamp."""
@@ -102,6 +110,18 @@ def pose_problem(
     slowest = int(np.argmax(periods))
     pace = slowest - 1 if periods[slowest] > 1.01 * periods[0] else -1
     noise = options.noise or _declared_noise([reference, *members])
+    return _modelled(curves, pace, noise, options, has_clock)
+
+
+def with_poses(problem: HandeyeProblem, options: HandeyeOptions) -> HandeyeProblem:
+    """The same trajectories with errors that are independent from pose to pose."""
+    curves, has_clock = (problem.reference, *problem.members), [x.has_clock for x in problem.layouts]
+    return _modelled(curves, problem.pace, "poses", options, has_clock)
+
+
+def _modelled(
+    curves: Sequence[Curve], pace: int, noise: NoiseModel, options: HandeyeOptions, has_clock: Sequence[bool]
+) -> HandeyeProblem:
     layouts = tuple(
         Layout(
             curve.segment_count if noise == "poses" else 0,
@@ -112,7 +132,7 @@ def pose_problem(
     )
     known = noise != "estimated" and all(
         t.name in options.levels or (t.covariances is not None and t.covariance_kind == noise)
-        for t in (reference, *members)
+        for t in (curve.trajectory for curve in curves)
     )
     return HandeyeProblem(curves[0], tuple(curves[1:]), layouts, noise, known, pace)
 

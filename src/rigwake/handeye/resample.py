@@ -97,26 +97,20 @@ class Curve:
 
         Times within a nanosecond of a pose are that pose.
         """
-        times, n = self.times_s, len(self.times_s)
-        nearest = np.minimum(np.searchsorted(times, times_s - 1e-9), n - 1)
-        at_node = np.abs(times[nearest] - times_s) <= 1e-9
-        segment_ids = self.trajectory.segment_ids
-        assert segment_ids is not None
-        if at_node.all():
-            return Sampled(self.world_from_body[nearest], self.twists[nearest], segment_ids[nearest])
-        left = np.where(at_node, np.minimum(nearest, n - 2), np.minimum(np.maximum(nearest - 1, 0), n - 2))
-        span = times[left + 1] - times[left]
-        alpha = np.minimum(np.maximum((times_s - times[left]) / span, -0.1), 1.1)
-        alpha = np.where(at_node, (nearest > left) * 1.0, alpha)
+        assert self.trajectory.segment_ids is not None
         poses = self.world_from_body
-        rotation, translation, twists = kernels.interpolate(
-            poses.rotation, poses.translation, self.increments, self.twists, left, alpha, span
+        rotation, translation, twists, segments = kernels.sample(
+            self.times_s,
+            poses.rotation,
+            poses.translation,
+            self.increments,
+            self.twists,
+            self.trajectory.segment_ids,
+            times_s,
+            self.max_gap_s,
+            0.1 * self.period_s,
         )
-        edge = 0.1 * self.period_s
-        inside = (times_s >= times[0] - edge) & (times_s <= times[-1] + edge)
-        bridged = (span <= self.max_gap_s) & (segment_ids[left] == segment_ids[left + 1])
-        known = inside & (bridged | at_node)
-        return Sampled(SE3(rotation, translation), twists, np.where(known, segment_ids[nearest], -1))
+        return Sampled(SE3(rotation, translation), twists, segments)
 
 
 def _node_twists(increments: Array, steps: Array) -> Array:

@@ -7,18 +7,14 @@ is fixed by itself (a board, GNSS), whatever the memory of its errors.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import numpy as np
 
 from rigwake.geometry.so3 import Array
 from rigwake.handeye.initial import with_worlds
 from rigwake.handeye.likelihood import Estimate, information_criterion, maximise
 from rigwake.handeye.motions import residuals, steps_between
-from rigwake.handeye.problem import HandeyeProblem, pose_problem
+from rigwake.handeye.problem import HandeyeProblem, with_poses
 from rigwake.handeye.values import HandeyeOptions
-from rigwake.trajectory import Trajectory
 
 _LONGEST_WITHOUT_DRIFT = 20_000  # steps
 _STRIDES = 8  # that make up the recording, where its variance over a long stride is taken
@@ -27,11 +23,7 @@ _STATIONARY = 1.000  # 5 % limit of the statistic for three series (Nyblom and H
 
 
 def without_drift(
-    problem: HandeyeProblem,
-    estimate: Estimate,
-    reference: Trajectory,
-    members: Sequence[Trajectory],
-    options: HandeyeOptions,
+    problem: HandeyeProblem, estimate: Estimate, options: HandeyeOptions
 ) -> tuple[HandeyeProblem, Estimate]:
     """The solution in the model of the poses where it explains the recording, else what was given.
 
@@ -40,13 +32,13 @@ def without_drift(
     """
     if len(estimate.valid) > _LONGEST_WITHOUT_DRIFT or not _saturates(problem, estimate):
         return problem, estimate
-    has_clock = [layout.has_clock for layout in problem.layouts]
-    as_poses = pose_problem(reference, members, replace(options, noise="poses"), has_clock)
-    other = maximise(as_poses, with_worlds(as_poses, estimate.mountings), options)
-    if not other.converged:
-        return problem, estimate
-    better = information_criterion(as_poses, other) < information_criterion(problem, estimate)
-    return (as_poses, other) if better or _stays(other) else (problem, estimate)
+    as_poses, to_beat = with_poses(problem, options), information_criterion(problem, estimate)
+
+    def explains(other: Estimate) -> bool:
+        return information_criterion(as_poses, other) < to_beat or _stays(other)
+
+    other = maximise(as_poses, with_worlds(as_poses, estimate.mountings), options, worthwhile=explains)
+    return (as_poses, other) if other.converged and explains(other) else (problem, estimate)
 
 
 def _saturates(problem: HandeyeProblem, estimate: Estimate) -> bool:
