@@ -1,6 +1,6 @@
 """Accuracy and time of hand-eye methods: the classical closed forms, the seed method and `ml`.
 
-    python benchmarks/handeye_methods.py [--draws 30]
+    python benchmarks/handeye_methods.py [--draws 30] [--only accuracy|time]
 
 The boat circuit of `noise_study.py` (176 poses). The closed forms get the motions over ten poses. OpenCV 5 has no
 `calibrateHandEye`; its methods, on all pairs of poses as it forms them, are shown in an environment with OpenCV 4:
@@ -16,7 +16,7 @@ import argparse
 import runpy
 from collections.abc import Callable
 from pathlib import Path
-from time import process_time
+from time import perf_counter, process_time
 
 import cv2
 import numpy as np
@@ -118,6 +118,42 @@ def compare(draws: int) -> None:
         print(f"| {name} | {cells} | {took:.1f} ({min(times[name]):.1f}) | {took / reference:.2f} |")
 
 
+def noisy_pair(kind: str, seed: int) -> list[Trajectory]:
+    """The boat circuit with errors of 1e-4 and 1 mm: of increments, of poses, of both, or none."""
+    rng = np.random.default_rng(seed)
+    pair = []
+    for name in ("FRONT", "PORT"):
+        poses = STUDY["boat"]() * STUDY[name]
+        for each in {"increments": ["cumulative"], "jitter": ["additive"], "exact": []}.get(
+            kind, ["cumulative", "additive"]
+        ):
+            share = 0.3 if kind == "both" and each == "cumulative" else 1.0
+            poses = STUDY["noisy"](poses, each, share * 1e-4, share * 1e-3, rng)
+        pair.append(STUDY["trajectory"](name.lower(), poses))
+    return pair
+
+
+def short_trajectories(draws: int) -> None:
+    """Time of one pair of 176 poses with the default options, after the first call."""
+    print(f"| 176 poses, {draws} draws | clock | CPU ms: median (best) | wall ms: median (best) | / 10 ms |")
+    print("|---|---|---|---|---|")
+    for kind in ("exact", "increments", "jitter", "both"):
+        for clock in (False, True):
+            options, cpu, wall = HandeyeOptions(time_offset=clock), [], []
+            for draw in range(draws):
+                front, port = noisy_pair(kind, draw)
+                if draw == 0:
+                    calibrate_handeye(front, [port], options)  # compiles
+                start = process_time(), perf_counter()
+                calibrate_handeye(front, [port], options)
+                cpu.append(1e3 * (process_time() - start[0]))
+                wall.append(1e3 * (perf_counter() - start[1]))
+            print(
+                f"| {kind} | {'estimated' if clock else 'known'} | {np.median(cpu):.1f} ({min(cpu):.1f}) | "
+                f"{np.median(wall):.1f} ({min(wall):.1f}) | {np.median(cpu) / 10:.2f} |"
+            )
+
+
 def long_trajectory() -> None:
     rng = np.random.default_rng(0)
     t = np.arange(100_000) * 0.01
@@ -143,10 +179,15 @@ def long_trajectory() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=10)
+    parser.add_argument("--only", choices=("accuracy", "time"))
     arguments = parser.parse_args()
-    compare(arguments.draws)
-    print()
-    long_trajectory()
+    if arguments.only != "time":
+        compare(arguments.draws)
+        print()
+    if arguments.only != "accuracy":
+        short_trajectories(2 * arguments.draws)
+        print()
+        long_trajectory()
 
 
 if __name__ == "__main__":
