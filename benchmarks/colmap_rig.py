@@ -19,7 +19,7 @@ import cv2  # before pycolmap: the other order breaks reading PNG files
 import numpy as np
 import pycolmap
 
-from odometry import colmap_camera
+from colmap_odometry import colmap_camera, write_mask
 from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.errors import EstimationError
 from rigwake.evaluate.calibrations import evaluate_calibration
@@ -28,10 +28,7 @@ from rigwake.geometry.se3 import SE3
 from rigwake.readers.open import open_recording
 from rigwake.readers.truth import read_true_rig, rig_in_frame
 from rigwake.recording import CameraStream, GnssStream, Recording
-from rigwake.tracking.hull import find_hull
-from rigwake.tracking.masks import lens_mask, pixel_grid
 
-WIDEST_DEG = 88.0
 NEAR_NS = 60_000_000
 
 
@@ -44,15 +41,6 @@ def write_images(stream: CameraStream, ticks_ns: np.ndarray, folder: Path) -> li
     for frame in stream.frames(np.array(sorted(name_of))):
         cv2.imwrite(str(folder / name_of[frame.index]), frame.image)
     return list(name_of.values())
-
-
-def write_mask(stream: CameraStream, path: Path) -> None:
-    """Black beyond 88 degrees, beyond the lens and on the own hull."""
-    usable = lens_mask(stream).usable
-    usable &= ~find_hull(stream, usable)
-    bearings, _ = stream.model.unproject(pixel_grid(stream.width_px, stream.height_px))
-    usable &= (bearings[:, 2] > np.cos(np.deg2rad(WIDEST_DEG))).reshape(usable.shape)
-    cv2.imwrite(str(path), usable.astype(np.uint8) * 255)
 
 
 def reconstruct(recording: Recording, ticks_ns: np.ndarray, folder: Path) -> pycolmap.Reconstruction:

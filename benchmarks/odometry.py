@@ -8,7 +8,6 @@ this process, tracking included. A path given in RIGWAKE_KITTI (the full odometr
 
 import os
 import sys
-import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,12 +15,13 @@ from typing import get_args
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from rigwake.cameras.base import CameraModel
 from rigwake.errors import RigwakeError
-from rigwake.evaluate.trajectories import absolute_error, kitti_error
+from rigwake.evaluate.trajectories import absolute_error, associate, kitti_error
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
+from rigwake.geometry.so3 import Array
 from rigwake.odometry.camera import CameraOdometryOptions, run_camera
 from rigwake.odometry.metric import metric_start
 from rigwake.odometry.monocular import estimate_monocular
@@ -40,7 +40,12 @@ from rigwake.trajectory import Trajectory
 
 DATA = Path(os.environ.get("RIGWAKE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 SEEDS = 3
-PEER_FEATURES = 2000  # of pycolmap, per image
+FOCAL_SHARE = 0.995
+KITTI_PEER_STEP, HARBOUR_PEER_STEP = (
+    2,
+    4,
+)  # the peer, of much slower mappers, gets every second or fourth frame
+Indices = NDArray[np.int64]
 HEADER = (
     "| recording | method | frames | alignment | ATE m | ATE % of path | rotation deg | CPU s | fps |\n"
     + "|---" * 9
@@ -60,25 +65,86 @@ def row(
     )
 
 
-def drift_row(name: str, truth: Trajectory, found: Trajectory, scale: float) -> None:
-    metric = replace(
-        found, world_from_body=SE3(found.world_from_body.rotation, scale * found.world_from_body.translation)
-    )
+def drift_row(name: str, truth: Trajectory, found: Trajectory) -> None:
+    """KITTI's figures, the rotation drift from first to last, and the errors over 100 m about the camera's axes."""
+    metric = scaled(truth, found)
     drift = kitti_error(truth, metric)
+    errors, turns = section_errors(truth, found)
+    whole, _ = section_errors(truth, found, None)
+    slope = (errors[:, 1] @ turns[:, 1]) / (turns[:, 1] @ turns[:, 1])
+    pitch, yaw, roll = np.sqrt(np.mean(errors**2, axis=0))
     print(
-        f"<!-- {name}: t_rel {drift.t_rel_percent:.2f} %, r_rel {drift.r_rel_deg_per_100m:.3f} deg/100 m -->",
+        f"<!-- {name}: t_rel {drift.t_rel_percent:.2f} %, r_rel {drift.r_rel_deg_per_100m:.3f} deg/100 m over "
+        f"{drift.sequences} sections (100 m: RMS of pitch {pitch:.3f}, yaw {yaw:.3f}, roll {roll:.3f}, yaw error "
+        f"{100 * slope:+.2f} % of the turn), first to last {np.linalg.norm(whole):.3f} deg/100 m -->",
         flush=True,
     )
+
+
+def section_errors(
+    truth: Trajectory, found: Trajectory, length_m: float | None = 100.0
+) -> tuple[Array, Array]:
+    """Rotation errors and true turns, degrees per 100 m about the axes of the camera at its start, of the sections
+    of that length that begin at every tenth pose; of the whole path for None."""
+    i, j = associate(truth, found)
+    true, estimate = truth.world_from_body[i], found.world_from_body[j]
+    travelled = np.r_[0, np.cumsum(np.linalg.norm(np.diff(true.translation, axis=0), axis=1))]
+    starts, ends = np.array([0]), np.array([len(i) - 1])
+    if length_m is not None:
+        starts = np.arange(0, len(i), 10)
+        ends = np.searchsorted(travelled, travelled[starts] + length_m)
+        starts, ends = starts[ends < len(i)], ends[ends < len(i)]
+    turn = true[starts].inverse() * true[ends]
+    error = (estimate[starts].inverse() * estimate[ends]) * turn.inverse()
+    per_100m = 100 / (travelled[ends] - travelled[starts])[:, None]
+    return np.rad2deg(so3.log(error.rotation)) * per_100m, np.rad2deg(so3.log(turn.rotation)) * per_100m
+
+
+def agreement_rows(name: str, truth: Trajectory, results: dict[str, Trajectory]) -> None:
+    """How far each method's rotations are from ours over 100 m, and how far both have the same errors there."""
+    ours = results["rigwake"]
+    for method, found in results.items():
+        if method == "rigwake":
+            continue
+        i, j = associate(ours, found)
+        pair = (errors_at(truth, ours, i), errors_at(truth, found, j))
+        apart = np.linalg.norm(pair[0] - pair[1], axis=1).mean()
+        correlation = np.corrcoef(pair[0].ravel(), pair[1].ravel())[0, 1]
+        print(
+            f"<!-- {name} {method}: rotations over 100 m {apart:.3f} deg from rigwake's, "
+            f"errors correlated by {correlation:.2f} -->",
+            flush=True,
+        )
+
+
+def errors_at(truth: Trajectory, found: Trajectory, index: Indices) -> Array:
+    """Rotation errors over 100 m of the path through the poses `index`."""
+    return section_errors(truth, poses_at(found, index))[0]
+
+
+def poses_at(path: Trajectory, index: Indices) -> Trajectory:
+    return Trajectory(
+        path.name, path.timestamps_ns[index], path.world_from_body[index], is_metric=path.is_metric
+    )
+
+
+def scaled(truth: Trajectory, found: Trajectory) -> Trajectory:
+    """`found` in the units of the truth."""
+    scale = absolute_error(truth, found, alignment="sim3").scale
+    poses = found.world_from_body
+    return replace(found, world_from_body=SE3(poses.rotation, scale * poses.translation))
 
 
 def monocular(name: str, stream: CameraStream, truth: Trajectory, peers: bool) -> None:
     started = time.process_time()
     tracks = track_camera(stream)
     tracking_s = time.process_time() - started
+    ours: dict[str, Trajectory] = {}
     for method, estimate in (
         ("frame to frame (seed)", frame_to_frame),
         ("rigwake, lens as given", lens_as_given),
         ("rigwake", lens_refined),
+        (f"rigwake, focal length {100 * (FOCAL_SHARE - 1):+.1f} %", another_focal_length),
     ):
         runs = []
         for seed in range(SEEDS):
@@ -88,10 +154,14 @@ def monocular(name: str, stream: CameraStream, truth: Trajectory, peers: bool) -
             runs.append((absolute_error(truth, found, alignment="sim3").rmse_m, cpu_s, found))
         _, cpu_s, found = sorted(runs, key=lambda run: run[0])[SEEDS // 2]
         row(name, f"{method}, median of {SEEDS} seeds", truth, found, len(stream), cpu_s, "sim3")
-        drift_row(f"{name} {method}", truth, found, absolute_error(truth, found, alignment="sim3").scale)
+        drift_row(f"{name} {method}", truth, found)
+        ours[method] = found
     if peers:
-        pycolmap_row(name, stream, truth, refine=False)
-        pycolmap_row(name, stream, truth, refine=True)
+        found_by_peer = pycolmap_rows(name, stream, truth, KITTI_PEER_STEP, refine=(False, True))
+        for method, found in found_by_peer.items():
+            drift_row(f"{name} {method}", truth, found)
+        ours |= found_by_peer
+        agreement_rows(name, truth, ours)
 
 
 def frame_to_frame(tracks: Tracks, stream: CameraStream, seed: int) -> Trajectory:
@@ -112,55 +182,30 @@ def lens_refined(tracks: Tracks, stream: CameraStream, seed: int) -> Trajectory:
     return visual.trajectory
 
 
-def pycolmap_row(name: str, stream: CameraStream, truth: Trajectory, refine: bool) -> None:
-    """COLMAP's incremental mapper on the same frames: SIFT on the CPU, sequential matching, focal length held.
-
-    refine: whether it refines the distortion, too.
-    """
-    import pycolmap
-
-    with tempfile.TemporaryDirectory() as folder:
-        images, database = Path(folder) / "images", Path(folder) / "database.db"
-        images.mkdir()
-        for frame in stream.frames():
-            cv2.imwrite(str(images / f"{frame.index:06d}.png"), frame.image)
-        model, params = colmap_camera(stream.model)
-        started = time.process_time()
-        pycolmap.extract_features(
-            database,
-            images,
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=pycolmap.ImageReaderOptions(camera_model=model, camera_params=params),
-            extraction_options={"sift": {"max_num_features": PEER_FEATURES}},
-            device=pycolmap.Device.cpu,
-        )
-        pycolmap.match_sequential(database, device=pycolmap.Device.cpu)
-        options = pycolmap.IncrementalPipelineOptions(
-            ba_refine_focal_length=False, ba_refine_extra_params=refine, multiple_models=False
-        )
-        models = pycolmap.incremental_mapping(database, images, folder, options)
-        cpu_s = time.process_time() - started
-    method = "pycolmap incremental, " + ("distortion refined" if refine else "lens as given")
-    best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
-    if best is None:
-        print(f"| {name} | {method} | 0/{len(stream)} | | | | | {cpu_s:.1f} | |", flush=True)
-        return
-    placed = sorted((int(Path(i.name).stem), i.cam_from_world()) for i in best.images.values() if i.has_pose)
-    cam_from_world = SE3.from_matrix(np.stack([pose.matrix() for _, pose in placed]))
-    stamps = stream.timestamps_ns[[index for index, _ in placed]]
-    found = Trajectory(stream.name, stamps, cam_from_world.inverse(), is_metric=False)
-    row(name, method, truth, found, len(stream), cpu_s, "sim3")
-    drift_row(f"{name} {method}", truth, found, absolute_error(truth, found, alignment="sim3").scale)
+def another_focal_length(tracks: Tracks, stream: CameraStream, seed: int) -> Trajectory:
+    """What the rotations owe to the focal length given: the same with another one."""
+    lens = stream.model
+    share = np.array([FOCAL_SHARE if name in ("fx", "fy") else 1.0 for name in lens.param_names])
+    other = lens.with_params(share * np.array(lens.params))
+    bearings, _ = other.unproject(tracks.pixels)
+    return lens_refined(replace(tracks, bearings_cam=bearings), replace(stream, model=other), seed)
 
 
-def colmap_camera(model: CameraModel) -> tuple[str, str]:
-    """COLMAP's name of the lens and its parameters; its first pixel has its centre at one half."""
-    values = dict(zip(model.param_names, model.params, strict=True))
-    extra = ("k1", "k2", "k3", "k4") if model.model == "kb4" else ("k1", "k2", "p1", "p2")
-    shift = {"cx": 0.5, "cy": 0.5}
-    names = ("fx", "fy", "cx", "cy", *extra)
-    params = ",".join(str(values[n] + shift.get(n, 0.0)) for n in names)
-    return "OPENCV_FISHEYE" if model.model == "kb4" else "OPENCV", params
+def pycolmap_rows(
+    name: str, stream: CameraStream, truth: Trajectory, step: int, refine: tuple[bool, ...]
+) -> dict[str, Trajectory]:
+    """Rows of COLMAP's mappers on every `step`-th frame; what they found, by method."""
+    from colmap_odometry import map_camera  # pycolmap is an optional peer
+
+    results, indices = {}, np.arange(0, len(stream), step)
+    for mapping in map_camera(stream, indices, refine):
+        method = f"{mapping.method}, frames in steps of {step}"
+        if mapping.trajectory is None:
+            print(f"| {name} | {method} | 0/{len(indices)} | | | | | {mapping.cpu_s:.1f} | |", flush=True)
+            continue
+        row(name, method, truth, mapping.trajectory, len(indices), mapping.cpu_s, "sim3")
+        results[method] = mapping.trajectory
+    return results
 
 
 def kitti(peers: bool) -> None:
@@ -228,7 +273,12 @@ def harbour(peers: bool) -> None:
         row(f"harbour_a {name}", "frame to frame (seed)", truth, seed, len(stream), cpu_s, "sim3")
         labels(name, result)
         if peers:
-            pycolmap_row(f"harbour_a {name}", stream, truth, refine=False)
+            pycolmap_rows(f"harbour_a {name}", stream, truth, HARBOUR_PEER_STEP, refine=(False,))
+            visual = result.visual
+            same = np.flatnonzero(visual.frame_indices % HARBOUR_PEER_STEP == 0)
+            found = poses_at(visual.trajectory, same)
+            method = "rigwake vision, of all frames the peer's"
+            row(f"harbour_a {name}", method, truth, found, len(found), cpu_s, "sim3")
 
 
 def speed(peers: bool) -> None:
