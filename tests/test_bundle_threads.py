@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bundle_rigs import Wanted, free_cameras, started_off, true_problem
-from rigwake.bundle import envelope, normal, schur, threads
+from rigwake import threads
+from rigwake.bundle import envelope, normal, schur
 from rigwake.bundle.problem import RigProblem, SolverOptions
 from rigwake.bundle.solver import solve
 
@@ -50,6 +51,24 @@ def test_ranges_cover_everything_once_and_are_worth_it(costs: list[int], least: 
     threads.over_ranges(bounds, lambda first, last: seen.extend(range(first, last)))
     assert sorted(seen) == list(range(len(costs)))
     assert len(bounds) - 1 <= max(sum(costs) // least, 1)
+
+
+def test_results_come_in_order_and_loops_may_be_nested() -> None:
+    bounds = np.arange(6)
+
+    def total(item: int) -> int:
+        parts = np.zeros(5, dtype=np.int64)
+        threads.over_ranges(bounds, lambda first, last: parts.__setitem__(first, item * last))
+        return int(parts.sum()) + sum(threads.in_order(abs, [item]))
+
+    assert list(threads.in_order(total, range(40))) == [16 * item for item in range(40)]
+
+
+def test_an_error_on_a_thread_reaches_the_caller() -> None:
+    with pytest.raises(ZeroDivisionError):
+        list(threads.in_order(lambda item: 1 // item, [1, 0, 2]))
+    with pytest.raises(ZeroDivisionError):
+        threads.over_ranges(np.arange(4), lambda first, last: first // (first - 1))
 
 
 @settings(max_examples=50, deadline=None)

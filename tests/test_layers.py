@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parent.parent / "src" / "rigwake"
 
 # left to right; a module may import from its own layer or from any layer further left
 LAYERS = [
-    ["errors", "atomic", "fingerprint"],
+    ["errors", "atomic", "fingerprint", "threads"],
     ["geometry"],
     ["cameras"],
     ["trajectory", "rig"],

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from rigwake.adjustment.gauge import with_gauge
 from rigwake.adjustment.proposals import predicted_pixels
@@ -27,6 +26,7 @@ from rigwake.bundle.solver import solve
 from rigwake.calibration import Calibration
 from rigwake.errors import RigwakeError
 from rigwake.evaluate.calibrations import compare_calibrations
+from rigwake.threads import one_blas_thread
 
 
 def residual_statistics(solution: RigSolution) -> dict[str, dict[str, Any]]:
@@ -94,7 +94,7 @@ def split_half(
 
     middle = len(problem.states) // 2
     # the limit is that of the process: set before both, so that neither lifts it while the other works
-    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(2) as pool:
+    with one_blas_thread(), ThreadPoolExecutor(2) as pool:
         earlier, later = pool.map(half, (0, middle), (middle, len(problem.states)))
     if isinstance(earlier, str):
         return earlier

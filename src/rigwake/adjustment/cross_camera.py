@@ -14,9 +14,9 @@ import numpy as np
 
 from rigwake.adjustment.proposals import HandOverOptions, Indices, Searches
 from rigwake.bundle.problem import Observations, RigProblem
-from rigwake.bundle.threads import over_ranges
 from rigwake.geometry.so3 import Array
 from rigwake.recording import CameraStream
+from rigwake.threads import over_ranges
 from rigwake.tracking.interpolation import Coefficients, spline_coefficients
 from rigwake.tracking.registration import PatchShape, References, drawn_by_bend, make_references, register
 

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake.bundle.problem import Observations, RigProblem
-from rigwake.bundle.threads import over_ranges
 from rigwake.cameras.base import Mask
 from rigwake.errors import UsageError
 from rigwake.geometry.interpolate import interpolate
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
+from rigwake.threads import over_ranges
 from rigwake.tracking.masks import inside
 
 Indices = NDArray[np.int64]

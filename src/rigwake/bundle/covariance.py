@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg.lapack import dtrtri
-from threadpoolctl import threadpool_limits
 
 from rigwake.bundle.clusters import clustered_scatter
 from rigwake.bundle.envelope import Factor, NotPositiveDefiniteError
@@ -24,6 +23,7 @@ from rigwake.bundle.problem import Mask, RigProblem, SolverOptions
 from rigwake.bundle.solver import equations_of, linearised, structure_of
 from rigwake.errors import EstimationError, UsageError
 from rigwake.geometry.so3 import Array
+from rigwake.threads import one_blas_thread
 
 _LEAST_SHARE = 1e-9  # of the information left; below, rounding speaks (sigma > 3e4 times the conditional one)
 _ROUNDING = 1e-12  # added to the states' scaled diagonal, so that a free gauge of theirs can be eliminated
@@ -119,7 +119,7 @@ def covariance_of(
     Raises EstimationError if a state has no information at all.
     """
     wanted = options or SolverOptions()
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_blas_thread():
         structure = structure_of(problem)
         linear = linearised(problem, structure, wanted)
         equations, _ = equations_of(linear, structure, damping=0.0)

@@ -15,8 +15,8 @@ from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf
 
 from rigwake.bundle.problem import Indices
-from rigwake.bundle.threads import over_ranges, ranges
 from rigwake.geometry.so3 import Array
+from rigwake.threads import over_ranges, ranges
 
 _LEAST_PRODUCTS = 2e7  # multiplications that are worth a thread
 

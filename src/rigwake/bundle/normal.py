@@ -20,8 +20,8 @@ from rigwake.bundle.layout import Layout
 from rigwake.bundle.motion import TimedPoses
 from rigwake.bundle.problem import Indices
 from rigwake.bundle.schur import FrameEquations, FramePairs
-from rigwake.bundle.threads import over_ranges
 from rigwake.geometry.so3 import Array
+from rigwake.threads import over_ranges
 
 
 @dataclass(frozen=True, eq=False)

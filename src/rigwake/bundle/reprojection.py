@@ -19,10 +19,10 @@ from rigwake.bundle.problem import BundleCamera, Indices, Mask, RigProblem, Solv
 from rigwake.bundle.rim import extrapolated
 from rigwake.bundle.robust import robust
 from rigwake.bundle.schur import LinearObservations
-from rigwake.bundle.threads import over_ranges, ranges
 from rigwake.cameras.base import Projection
 from rigwake.geometry import so3
 from rigwake.geometry.so3 import Array
+from rigwake.threads import over_ranges, ranges
 
 _LEAST_OBSERVATIONS = 10_000  # that are worth a thread
 

@@ -16,8 +16,8 @@ import numpy as np
 from numba import njit
 
 from rigwake.bundle.problem import Indices
-from rigwake.bundle.threads import over_ranges, ranges
 from rigwake.geometry.so3 import Array
+from rigwake.threads import over_ranges, ranges
 
 _LEAST_INFORMATION = (
     1e-10  # added to a landmark's scaled (unit diagonal) block: parallax too small to place it

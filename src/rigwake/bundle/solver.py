@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from rigwake.bundle.envelope import Envelope, NotPositiveDefiniteError
 from rigwake.bundle.factors import coupled_states, measured_factors, out_of_range_notes
@@ -32,6 +31,7 @@ from rigwake.bundle.schur import (
 )
 from rigwake.errors import EstimationError
 from rigwake.geometry.so3 import Array
+from rigwake.threads import one_blas_thread
 
 _LARGEST_DAMPING = 1e12
 
@@ -121,7 +121,7 @@ def solve(problem: RigProblem, options: SolverOptions | None = None) -> RigSolut
     step that lowers the cost from a point that is no minimum.
     """
     wanted = options or SolverOptions()
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_blas_thread():
         return _minimise(problem, wanted)
 
 
