@@ -110,6 +110,45 @@ def _normal_equations(
     return H, g, cost
 
 
+@numba.njit(cache=True)
+def _moved(R: Array, c: Array, step: Array) -> tuple[Array, Array]:
+    """`SE3(R, c).retract(step)`, without the cost of many small arrays."""
+    w = step[:3]
+    squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    if squared < 1e-8:
+        a, b, d = 1 - squared / 6, 0.5 - squared / 24, 1 / 6 - squared / 120
+    else:
+        angle = np.sqrt(squared)
+        a = np.sin(angle) / angle
+        b, d = 2 * np.sin(angle / 2) ** 2 / squared, (1 - a) / squared
+    K = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+    square = K @ K
+    turn, along = np.eye(3) + a * K + b * square, np.eye(3) + b * K + d * square
+    return R @ turn, c + R @ (along @ step[3:])
+
+
+@numba.njit(cache=True)
+def _minimise(
+    R: Array, c: Array, points: Array, bearings: Array, stds: Array, scale: float, iterations: int
+) -> tuple[Array, Array, Array]:
+    """Levenberg-Marquardt: the pose and the normal matrix there."""
+    H, g, cost = _normal_equations(R, c, points, bearings, stds, scale)
+    damping = 1e-6
+    for _ in range(iterations):
+        step = -np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-12), g)
+        new_R, new_c = _moved(R, c, step)
+        new_H, new_g, new_cost = _normal_equations(new_R, new_c, points, bearings, stds, scale)
+        if new_cost <= cost:
+            done = cost - new_cost < 1e-6 * cost
+            R, c, H, g, cost = new_R, new_c, new_H, new_g, new_cost
+            damping = max(damping * 0.1, 1e-9)
+            if done:
+                break
+        else:
+            damping *= 100
+    return R, c, H
+
+
 def refine_absolute_pose(
     world_from_cam: SE3,
     points_world: Array,
@@ -124,32 +163,20 @@ def refine_absolute_pose(
     angle_stds: (N,) standard deviation of a bearing per axis, radians. robust_scale: in standard deviations.
     The covariance is the inverse of the weighted normal matrix; infinite where that is singular.
     """
-    points, bearings = np.ascontiguousarray(points_world), np.ascontiguousarray(bearings_cam)
-    stds = np.ascontiguousarray(angle_stds, dtype=np.float64)
-
-    def linearise(x: SE3) -> tuple[Array, Array, float]:
-        R, c = np.ascontiguousarray(x.rotation), np.ascontiguousarray(x.translation)
-        return _normal_equations(R, c, points, bearings, stds, robust_scale)
-
-    H, g, cost = linearise(world_from_cam)
-    damping = 1e-6
-    for _ in range(iterations):
-        step = -np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-12), g)
-        moved = world_from_cam.retract(step)
-        new_H, new_g, new_cost = linearise(moved)
-        if new_cost <= cost:
-            done = cost - new_cost < 1e-6 * cost
-            world_from_cam, H, g, cost = moved, new_H, new_g, new_cost
-            damping = max(damping * 0.1, 1e-9)
-            if done:
-                break
-        else:
-            damping *= 100
+    R, c, H = _minimise(
+        np.ascontiguousarray(world_from_cam.rotation),
+        np.ascontiguousarray(world_from_cam.translation),
+        np.ascontiguousarray(points_world),
+        np.ascontiguousarray(bearings_cam),
+        np.ascontiguousarray(angle_stds, dtype=np.float64),
+        robust_scale,
+        iterations,
+    )
     try:
         covariance = np.linalg.inv(H)
     except np.linalg.LinAlgError:
         covariance = np.full((6, 6), np.inf)
-    return world_from_cam, np.asarray(covariance)
+    return SE3(R, c), np.asarray(covariance)
 
 
 @dataclass(frozen=True, eq=False)
