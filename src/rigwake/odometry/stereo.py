@@ -24,12 +24,13 @@ from rigwake.odometry.observations import index_observations, radians_per_pixel
 from rigwake.odometry.options import OdometryOptions
 from rigwake.odometry.visual_map import VisualMap
 from rigwake.recording import CameraStream, Image
-from rigwake.tracking.klt import follow
+from rigwake.tracking.klt import follow, pyramid
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
 Indices = NDArray[np.int64]
 _STD_PX = 0.3  # of a match between the two cameras, which is not registered as finely as a track
+_WINDOW_PX, _LEVELS = 21, 4  # of the search
 _CHAIN_STD_PX = 0.5
 _MIN_DISPARITY_STDS = (
     15.0  # a point is placed if its disparity is so sure: nearer ones only would bias the scale
@@ -104,9 +105,8 @@ def _follow(
     """Pyramidal Lucas-Kanade from one camera to the other, on contrast-normalised images, checked backwards."""
     equalise = cv2.createCLAHE(2.0, (8, 8)).apply
     start = np.where(valid[:, None], far, pixels)
-    landed, believed = follow(
-        equalise(image), equalise(other), pixels, start, window_px=21, levels=4, max_forward_backward_px=0.5
-    )
+    one, two = (pyramid(np.asarray(equalise(i), np.uint8), _WINDOW_PX, _LEVELS) for i in (image, other))
+    landed, believed = follow(one, two, pixels, start, window_px=_WINDOW_PX, max_forward_backward_px=0.5)
     return landed, believed & valid
 
 

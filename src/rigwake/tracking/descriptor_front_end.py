@@ -32,22 +32,26 @@ class DescriptorFrontEnd:
         self.ages = np.empty(0, dtype=np.int64)
         self.points = Keypoints(np.empty((0, 2)), np.empty(0), np.empty((0, 1), np.float32))
 
-    def step(self, image: Image, usable: Mask, high: Mask | None = None) -> Observed:
+    def prepare(self, image: Image) -> Image:
+        """Nothing can be done ahead: where keypoints are looked for differs from image to image."""
+        return image
+
+    def step(self, now: Image, usable: Mask, high: Mask | None = None) -> Observed:
         """Observations in the next image; `usable` (H, W) says where points may be; `high` makes no difference."""
-        now = self.detect(image, usable)
-        ids = np.full(len(now.pixels), -1)
-        before, after = self._match(self.points, now)
+        points = self.detect(now, usable)
+        ids = np.full(len(points.pixels), -1)
+        before, after = self._match(self.points, points)
         ids[after] = self.ids[before]
         new = ids < 0
         ids[new] = self.next_id + np.arange(new.sum())
         self.next_id += int(new.sum())
 
         unseen = np.setdiff1d(np.flatnonzero(self.ages < self.options.memory), before)
-        self.points = _join(now, self.points, unseen)
+        self.points = _join(points, self.points, unseen)
         self.ids = np.concatenate([ids, self.ids[unseen]])
         self.ages = np.concatenate([np.zeros(len(ids), dtype=np.int64), self.ages[unseen] + 1])
         order = np.argsort(ids)
-        return ids[order], now.pixels[order], _STD_PX[self.options.front_end] * now.scales[order]
+        return ids[order], points.pixels[order], _STD_PX[self.options.front_end] * points.scales[order]
 
     def _match(self, before: Keypoints, now: Keypoints) -> tuple[Indices, Indices]:
         options = self.options

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +57,7 @@ def track_camera(
     run = _Run()
     row_of_index = {int(index): row for row, index in enumerate(chosen)}
     started = time.perf_counter()
-    for done, frame in enumerate(_ahead(stream.frames(chosen))):
+    for done, (frame, prepared) in enumerate(_ahead(stream.frames(chosen), front_end.prepare)):
         kind = run.judge(frame.image)
         if kind == "usable":
             row = row_of_index[frame.index]
@@ -67,33 +67,44 @@ def track_camera(
             if up_cam is not None and horizon is not None and np.isfinite(up_cam[row]).all():
                 above = usable & ~horizon.below(up_cam[row])
                 high = horizon.high(up_cam[row])
-            run.add(row, front_end.step(frame.image, above, high))
+            run.add(row, front_end.step(prepared, above, high))
             last_ns = frame.timestamp_ns
         if progress is not None:
             progress(done + 1)
     return run.tracks(stream, chosen, time.perf_counter() - started)
 
 
-def _ahead(frames: Iterator[Frame]) -> Iterator[Frame]:
-    """The frames, each read and decoded while the one before is worked on."""
+def _ahead(frames: Iterator[Frame], prepare: Callable[[Image], Prepared]) -> Iterator[tuple[Frame, Prepared]]:
+    """The frames, each read, decoded and prepared while the one before is worked on."""
+
+    def read() -> tuple[Frame, Prepared] | None:
+        frame = next(frames, None)
+        return None if frame is None else (frame, prepare(frame.image))
+
     with ThreadPoolExecutor(1) as reader:
-        upcoming = reader.submit(next, frames, None)
-        while (frame := upcoming.result()) is not None:
-            upcoming = reader.submit(next, frames, None)
-            yield frame
+        upcoming = reader.submit(read)
+        while (found := upcoming.result()) is not None:
+            upcoming = reader.submit(read)
+            yield found
 
 
-class FrontEnd(Protocol):
+Prepared = TypeVar("Prepared")
+
+
+class FrontEnd(Protocol[Prepared]):
     """Follows points through consecutive images of one camera."""
+
+    def prepare(self, image: Image) -> Prepared:
+        """What does not depend on the images before: may be called ahead of `step`, on another thread."""
 
     def forget(self) -> None:
         """Start anew: the next image does not continue the last one."""
 
-    def step(self, image: Image, usable: Mask, high: Mask | None = None) -> Observed:
+    def step(self, now: Prepared, usable: Mask, high: Mask | None = None) -> Observed:
         """Observations in the next image; `usable` (H, W) says where points may be, `high` where most is sky."""
 
 
-def _front_end(model: CameraModel, options: TrackingOptions) -> FrontEnd:
+def _front_end(model: CameraModel, options: TrackingOptions) -> FrontEnd[Any]:
     return KltFrontEnd(model, options) if options.front_end == "klt" else DescriptorFrontEnd(options)
 
 

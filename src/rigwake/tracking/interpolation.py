@@ -64,52 +64,60 @@ def spline_coefficients(image: Image) -> Coefficients:
     return out
 
 
+# typed, for the compiled loops: numba turns `1 - t` into a double, and checks a signed index for being negative
+_1, _2, _3, _4, _6 = (np.float32(value) for value in (1, 2, 3, 4, 6))
+_NEXT = np.uint32(1)
+
+
 @register_jitable(inline="always")
-def _weights(t: float) -> tuple[float, float, float, float]:
-    s = 1 - t
+def _weights(t):  # type: ignore[no-untyped-def]
+    s = _1 - t
     return (
-        s * s * s / 6,
-        (4 - 6 * t * t + 3 * t * t * t) / 6,
-        (4 - 6 * s * s + 3 * s * s * s) / 6,
-        t * t * t / 6,
+        s * s * s / _6,
+        (_4 - _6 * t * t + _3 * t * t * t) / _6,
+        (_4 - _6 * s * s + _3 * s * s * s) / _6,
+        t * t * t / _6,
     )
 
 
 @register_jitable(inline="always")
-def _slopes(t: float) -> tuple[float, float, float, float]:
-    s = 1 - t
-    return -s * s / 2, (9 * t * t - 12 * t) / 6, (12 * s - 9 * s * s) / 6, t * t / 2
+def _slopes(t):  # type: ignore[no-untyped-def]
+    s = _1 - t
+    return -s * s / _2, (_3 * t * t - _4 * t) / _2, (_4 * s - _3 * s * s) / _2, t * t / _2
+
+
+@register_jitable(inline="always")
+def _along(c, row, column, w):  # type: ignore[no-untyped-def]
+    i0 = column - _NEXT
+    i2 = column + _NEXT
+    i3 = i2 + _NEXT
+    return w[0] * c[row, i0] + w[1] * c[row, column] + w[2] * c[row, i2] + w[3] * c[row, i3]
 
 
 @register_jitable(inline="always")
 def sample(coefficients: Coefficients, x: float, y: float) -> float:
     """Grey level at (x, y); 1 <= x < W - 2 and 1 <= y < H - 2 is the caller's duty."""
-    column, row = int(x), int(y)
-    a0, a1, a2, a3 = _weights(x - np.float32(column))
-    b0, b1, b2, b3 = _weights(y - np.float32(row))
-    c = coefficients
-    r, i = row - 1, column - 1
-    v0 = a0 * c[r, i] + a1 * c[r, i + 1] + a2 * c[r, i + 2] + a3 * c[r, i + 3]
-    v1 = a0 * c[r + 1, i] + a1 * c[r + 1, i + 1] + a2 * c[r + 1, i + 2] + a3 * c[r + 1, i + 3]
-    v2 = a0 * c[r + 2, i] + a1 * c[r + 2, i + 1] + a2 * c[r + 2, i + 2] + a3 * c[r + 2, i + 3]
-    v3 = a0 * c[r + 3, i] + a1 * c[r + 3, i + 1] + a2 * c[r + 3, i + 2] + a3 * c[r + 3, i + 3]
-    return b0 * v0 + b1 * v1 + b2 * v2 + b3 * v3
+    column, row = np.uint32(x), np.uint32(y)
+    a, b = _weights(np.float32(x - np.float32(column))), _weights(np.float32(y - np.float32(row)))
+    v0 = _along(coefficients, row - _NEXT, column, a)
+    v1 = _along(coefficients, row, column, a)
+    v2 = _along(coefficients, row + _NEXT, column, a)
+    v3 = _along(coefficients, row + _NEXT + _NEXT, column, a)
+    return b[0] * v0 + b[1] * v1 + b[2] * v2 + b[3] * v3
 
 
 @register_jitable
 def sample_with_gradient(coefficients: Coefficients, x: float, y: float) -> tuple[float, float, float]:
     """Grey level at (x, y) and its derivatives by x and y; same duty as for `sample`."""
-    column, row = int(x), int(y)
-    wx, wy = _weights(x - column), _weights(y - row)
-    sx, sy = _slopes(x - column), _slopes(y - row)
+    column, row = np.uint32(x), np.uint32(y)
+    u, v = np.float32(x - np.float32(column)), np.float32(y - np.float32(row))
+    wx, wy, sx, sy = _weights(u), _weights(v), _slopes(u), _slopes(v)
     value = by_x = by_y = 0.0
+    line = row - _NEXT
     for j in range(4):
-        along = slope = 0.0
-        for i in range(4):
-            c = coefficients[row - 1 + j, column - 1 + i]
-            along += wx[i] * c
-            slope += sx[i] * c
+        along = _along(coefficients, line, column, wx)
         value += wy[j] * along
-        by_x += wy[j] * slope
+        by_x += wy[j] * _along(coefficients, line, column, sx)
         by_y += sy[j] * along
+        line += _NEXT
     return value, by_x, by_y

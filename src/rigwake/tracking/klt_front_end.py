@@ -13,7 +13,7 @@ from rigwake.geometry.so3 import Array
 from rigwake.recording import Image
 from rigwake.tracking.features import detect_corners
 from rigwake.tracking.interpolation import Coefficients, spline_coefficients
-from rigwake.tracking.klt import follow
+from rigwake.tracking.klt import Pyramid, follow, pyramid
 from rigwake.tracking.masks import inside
 from rigwake.tracking.options import TrackingOptions
 from rigwake.tracking.registration import PatchShape, References, drawn_by_bend, make_references, register
@@ -21,6 +21,15 @@ from rigwake.tracking.warps import dominant_rotation, rotation_warps, stencil_be
 
 Observed = tuple[NDArray[np.int64], Array, Array]
 """Track ids (N,), pixels (N, 2), std_px (N,) seen in one frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedImage:
+    """An image, its spline coefficients, and its pyramid."""
+
+    image: Image
+    coefficients: Coefficients
+    scales: Pyramid
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,24 +78,29 @@ class KltFrontEnd:
         self.shape = PatchShape.disc(options.patch_radius_px)
         self.noise = 1.5  # grey levels, until registrations tell
         self.live: _Live | None = None
-        self.image: Image | None = None
+        self.last: PreparedImage | None = None
         self.next_id = 0
         self.count_detected = 0
         self.steps_since_detection = 0
 
     def forget(self) -> None:
         """Start anew: the next image does not continue the last one."""
-        self.live = self.image = None
+        self.live = self.last = None
 
-    def step(self, image: Image, usable: Mask, high: Mask | None = None) -> Observed:
+    def prepare(self, image: Image) -> PreparedImage:
+        """What does not depend on the images before: may be called ahead of `step`, on another thread."""
+        options = self.options
+        scales = pyramid(image, options.window_px, options.levels)
+        return PreparedImage(image, spline_coefficients(image), scales)
+
+    def step(self, now: PreparedImage, usable: Mask, high: Mask | None = None) -> Observed:
         """Observations in the next image; `usable` (H, W) says where points may be, `high` where most is sky."""
-        coefficients = spline_coefficients(image)
-        live = self._continue(image, coefficients, usable)
+        live = self._continue(now, usable)
         self.steps_since_detection += 1
         if live is None or self._should_detect(len(live.ids)):
-            live = self._detect(image, coefficients, usable, high, live)
+            live = self._detect(now, usable, high, live)
             self.count_detected, self.steps_since_detection = len(live.ids), 0
-        self.live, self.image = live, image
+        self.live, self.last = live, now
         return live.ids, live.pixels, live.std_px
 
     def _should_detect(self, count: int) -> bool:
@@ -96,18 +110,17 @@ class KltFrontEnd:
         due = self.steps_since_detection >= options.redetect_every
         return many_lost or (due and count < options.redetect_below * options.max_features)
 
-    def _continue(self, image: Image, coefficients: Coefficients, usable: Mask) -> _Live | None:
+    def _continue(self, now: PreparedImage, usable: Mask) -> _Live | None:
         """The live points that are found in the image."""
         live, options = self.live, self.options
-        if live is None or self.image is None or len(live.ids) == 0:
+        if live is None or self.last is None or len(live.ids) == 0:
             return None
         predicted, believed = follow(
-            self.image,
-            image,
+            self.last.scales,
+            now.scales,
             live.pixels,
             live.pixels,
             window_px=options.window_px,
-            levels=options.levels,
             max_forward_backward_px=options.max_forward_backward_px,
         )
         bearings, valid = self.model.unproject(predicted)
@@ -116,7 +129,7 @@ class KltFrontEnd:
         turned = dominant_rotation(live.bearings, bearings) @ live.image_from_reference
         turns, bends, valid = rotation_warps(self.model, live.stencils, turned, bearings)
         seen = register(
-            coefficients,
+            now.coefficients,
             live.references,
             self.shape,
             predicted,
@@ -132,7 +145,7 @@ class KltFrontEnd:
         kept = valid & on_lens & seen.found & inside(usable, pixels)
         kept &= (seen.correlation >= options.min_correlation) & (seen.std_px <= options.max_std_px)
         kept &= (stretch[:, 0] <= options.max_stretch) & (stretch[:, 1] >= 1 / options.max_stretch)
-        now = _Live(
+        found = _Live(
             live.ids,
             pixels,
             bearings,
@@ -143,16 +156,14 @@ class KltFrontEnd:
             turned,
             live.references,
         )
-        return now.take(kept)
+        return found.take(kept)
 
-    def _detect(
-        self, image: Image, coefficients: Coefficients, usable: Mask, high: Mask | None, live: _Live | None
-    ) -> _Live:
+    def _detect(self, now: PreparedImage, usable: Mask, high: Mask | None, live: _Live | None) -> _Live:
         """The live points and new corners."""
         options = self.options
         occupied = np.empty((0, 2)) if live is None else live.pixels
         corners = detect_corners(
-            image,
+            now.image,
             usable,
             occupied,
             wanted=options.max_features - len(occupied),
@@ -164,7 +175,7 @@ class KltFrontEnd:
         )
         stencils, valid = stencil_bearings(self.model, corners)
         bearings, on_lens = self.model.unproject(corners)
-        references, textured = make_references(coefficients, corners, self.shape)
+        references, textured = make_references(now.coefficients, corners, self.shape)
         n = len(corners)
         same = np.broadcast_to(np.eye(2), (n, 2, 2))
         new = _Live(

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from rigwake.cameras.base import Mask
 from rigwake.geometry.so3 import Array
+from rigwake.threads import over_ranges, ranges
 from rigwake.tracking.interpolation import Coefficients, sample, sample_with_gradient
 from rigwake.tracking.small_solve import cholesky_solve, position_spread
 
@@ -33,6 +34,7 @@ _UNKNOWNS = 6  # two of the position, four of the warp
 _ROWS = _UNKNOWNS + _PHOTOMETRIC
 _MIN_GAIN = 0.05  # a patch with less of its first contrast has gone dark
 _MIN_VARIANCE = 0.25  # grey levels^2: rounding to whole grey levels alone leaves 1/12 in each image
+_LEAST_PATCHES = 50  # that are worth a thread
 _CONVERGED_PX = 0.015  # a step leaves about a fifth of the error: what remains is far below the noise
 
 
@@ -142,23 +144,20 @@ def register(
     warp_prior_std: how far each entry of the warp may stray from the prediction, in px per px.
     max_shift_px: a patch that moves further from its start has diverged.
     """
+    n = len(references)
     pixels = np.ascontiguousarray(pixels, dtype=np.float64).copy()
     warps = np.ascontiguousarray(predicted_warps, dtype=np.float64).copy()
-    found, correlation, variance, spread, lag_sums = _register(
-        coefficients,
-        references.pattern,
-        references.information,
-        references.contrast,
-        shape.offsets,
-        shape.root_weights,
-        shape.lower_right,
-        shape.lower_left,
-        pixels,
-        warps,
-        1.0 / warp_prior_std**2,
-        max_shift_px,
-        iterations,
-    )
+    found, lag_sums = np.zeros(n, np.bool_), np.zeros((n, 3))
+    correlation, variance, spread = np.zeros(n), np.zeros(n), np.zeros(n)
+
+    def work(first: int, last: int) -> None:
+        _register(
+            first, last, coefficients, references.pattern, references.information, references.contrast,
+            shape.offsets, shape.root_weights, shape.lower_right, shape.lower_left, 1.0 / warp_prior_std**2,
+            max_shift_px, iterations, pixels, warps, found, correlation, variance, spread, lag_sums,
+        )  # fmt: skip
+
+    over_ranges(ranges(np.ones(n), _LEAST_PATCHES), work)
     std_px = np.sqrt(spread * variance * _noise_bandwidth(lag_sums[found]))
     return Registration(pixels, warps, found, correlation, std_px, np.sqrt(variance))
 
@@ -258,32 +257,18 @@ def _orthonormalise(basis: Array) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _register(
-    coefficients: Coefficients,
-    pattern: Floats,
-    information: Array,
-    contrast: Array,
-    offsets: Floats,
-    root_weights: Floats,
-    lower_right: NDArray[np.int64],
-    lower_left: NDArray[np.int64],
-    pixels: Array,
-    warps: Array,
-    warp_precision: float,
-    max_shift_px: float,
-    iterations: int,
-) -> tuple[Mask, Array, Array, Array, Array]:
-    """Works on `pixels` and `warps` in place; found, correlation, variance, spread and lag sums per patch."""
-    n_patches, _, n_samples = pattern.shape
+def _register(  # type: ignore[no-untyped-def]
+    first, last, coefficients, pattern, information, contrast, offsets, root_weights, lower_right, lower_left,
+    warp_precision, max_shift_px, iterations, pixels, warps, found, correlation, variance, spread, lag_sums,
+):  # fmt: skip
+    """Moves `pixels` and `warps` of a range of patches; the arrays after them, which are zero, are filled."""
+    n_samples = pattern.shape[2]
     freedom = n_samples - _PHOTOMETRIC - 2
-    found = np.zeros(n_patches, np.bool_)
-    correlation, variance, spread = np.zeros(n_patches), np.zeros(n_patches), np.zeros(n_patches)
-    lag_sums = np.zeros((n_patches, 3))
     values, sums = np.empty(n_samples, np.float32), np.empty(_ROWS, np.float32)
     matrix, step = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
-    for n in range(n_patches):
+    for n in range(first, last):
         start_x, start_y = pixels[n, 0], pixels[n, 1]
-        prediction_from_patch = np.linalg.inv(warps[n])
+        prediction_from_patch = _inverse(warps[n])
         for _ in range(iterations):
             power = _correlate(
                 coefficients, pattern[n], offsets, root_weights, pixels[n], warps[n], values, sums
@@ -297,7 +282,7 @@ def _register(
                 spread[n] = position_spread(matrix)
                 _neighbour_products(values, pattern[n], sums, lower_right, lower_left, lag_sums[n])
                 break
-            strayed = prediction_from_patch @ warps[n]
+            strayed = _product(prediction_from_patch, warps[n])
             _normal_equations(gain, information[n], sums, warp_precision * variance[n], strayed, matrix, step)
             moved = _step(matrix, step, pixels[n], warps[n])
             shift = max(abs(pixels[n, 0] - start_x), abs(pixels[n, 1] - start_y))
@@ -305,7 +290,6 @@ def _register(
                 break
             found[n] = moved < _CONVERGED_PX
         found[n] = found[n] and spread[n] > 0
-    return found, correlation, variance, spread, lag_sums
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -361,6 +345,23 @@ def _normal_equations(
 
 
 @register_jitable
+def _inverse(a: Array) -> Array:
+    """Of a 2x2 matrix: for so few numbers a call of LAPACK costs more than the work."""
+    determinant = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    return np.array([[a[1, 1], -a[0, 1]], [-a[1, 0], a[0, 0]]]) / determinant
+
+
+@register_jitable
+def _product(a: Array, b: Array) -> Array:
+    """Of two 2x2 matrices."""
+    out = np.empty((2, 2))
+    for i in range(2):
+        for j in range(2):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j]
+    return out
+
+
+@register_jitable
 def _step(matrix: Array, step: Array, pixel: Array, warp: Array) -> float:
     """Solve for the template's increment and compose its inverse with the warp (in place); pixels moved,
     negative if it cannot be done. `matrix` is left as its Cholesky factor."""
@@ -370,7 +371,7 @@ def _step(matrix: Array, step: Array, pixel: Array, warp: Array) -> float:
     determinant = increment[0, 0] * increment[1, 1] - increment[0, 1] * increment[1, 0]
     if not 0.2 < determinant < 5.0:
         return -1.0
-    warp[:] = warp @ np.linalg.inv(increment)
+    warp[:] = _product(warp, _inverse(increment))
     dx = warp[0, 0] * step[0] + warp[0, 1] * step[1]
     dy = warp[1, 0] * step[0] + warp[1, 1] * step[1]
     pixel[0] -= dx

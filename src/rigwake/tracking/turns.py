@@ -6,21 +6,26 @@ towards each other and by how much their clocks differ, and so where the horizon
 
 from __future__ import annotations
 
+from functools import partial
+from itertools import pairwise
+
 import numpy as np
 
 from rigwake.cameras.base import CameraModel, Mask
 from rigwake.errors import EstimationError, UsageError
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import Array
-from rigwake.recording import CameraStream, Image
+from rigwake.recording import CameraStream, Frame, Image
+from rigwake.threads import in_order
 from rigwake.tracking.features import detect_corners
-from rigwake.tracking.klt import follow
+from rigwake.tracking.klt import follow, pyramid
 from rigwake.tracking.masks import beyond_lens
 from rigwake.tracking.warps import dominant_rotation
 from rigwake.trajectory import Trajectory
 
 _CORNERS = 120
 _MIN_MATCHES = 12
+_WINDOW_PX, _LEVELS = 21, 4  # of the search
 _MAX_GAP_S = 0.5
 
 
@@ -40,15 +45,11 @@ def visual_turns(stream: CameraStream, *, frames: int = 150) -> Trajectory:
     usable = ~beyond_lens(stream.model)
     stamps: list[int] = []
     rotations, segments = [np.eye(3)], [0]
-    before: Image | None = None
-    for frame in stream.frames(np.arange(start, start + count)):
-        if before is not None:
-            near = (frame.timestamp_ns - stamps[-1]) * 1e-9 <= _MAX_GAP_S
-            turn = _turn(before, frame.image, stream.model, usable) if near else None
-            rotations.append(rotations[-1] @ (np.eye(3) if turn is None else turn.T))
-            segments.append(segments[-1] + (turn is None))
-        before = frame.image
-        stamps.append(frame.timestamp_ns)
+    pairs = pairwise(stream.frames(np.arange(start, start + count)))
+    for before_ns, after_ns, turn in in_order(partial(_turn, model=stream.model, usable=usable), pairs):
+        rotations.append(rotations[-1] @ (np.eye(3) if turn is None else turn.T))
+        segments.append(segments[-1] + (turn is None))
+        stamps += [after_ns] if stamps else [before_ns, after_ns]
     if len(stamps) - len(set(segments)) < _MIN_MATCHES:
         raise EstimationError(
             f"camera {stream.name}: hardly any two images could be compared.",
@@ -63,8 +64,16 @@ def visual_turns(stream: CameraStream, *, frames: int = 150) -> Trajectory:
     )
 
 
-def _turn(before: Image, after: Image, model: CameraModel, usable: Mask) -> Array | None:
-    """Rotation `after_from_before` (3, 3) that most corners agree on; None with too few of them."""
+def _turn(pair: tuple[Frame, Frame], model: CameraModel, usable: Mask) -> tuple[int, int, Array | None]:
+    """Stamps of two frames, and the rotation `after_from_before` (3, 3) that most corners agree on; None with too few
+    of them, and across a gap."""
+    before, after = pair
+    near = (after.timestamp_ns - before.timestamp_ns) * 1e-9 <= _MAX_GAP_S
+    turn = _rotation(before.image, after.image, model, usable) if near else None
+    return before.timestamp_ns, after.timestamp_ns, turn
+
+
+def _rotation(before: Image, after: Image, model: CameraModel, usable: Mask) -> Array | None:
     corners = detect_corners(
         before,
         usable,
@@ -74,8 +83,9 @@ def _turn(before: Image, after: Image, model: CameraModel, usable: Mask) -> Arra
         min_distance_px=12,
         min_strength=400.0,
     )
+    scales, later = (pyramid(image, _WINDOW_PX, _LEVELS) for image in (before, after))
     landed, believed = follow(
-        before, after, corners, corners, window_px=21, levels=4, max_forward_backward_px=0.5
+        scales, later, corners, corners, window_px=_WINDOW_PX, max_forward_backward_px=0.5
     )
     bearings_before, valid = model.unproject(corners)
     bearings_after, still_valid = model.unproject(landed)

@@ -7,7 +7,10 @@ from the lens and from the rotation, which the tracks themselves tell.
 
 from __future__ import annotations
 
+from math import sqrt
+
 import numpy as np
+from numba import njit
 
 from rigwake.cameras.base import CameraModel, Mask
 from rigwake.geometry import so3
@@ -15,6 +18,7 @@ from rigwake.geometry.so3 import Array
 
 _STENCIL_PX = 2.0
 _STENCIL = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [0, 0]]) * _STENCIL_PX
+_ROUNDS = 5
 _MIN_ANGLE = 1e-4  # scale of the robust loss: about a fiftieth of a pixel of a wide lens
 
 
@@ -23,15 +27,36 @@ def dominant_rotation(bearings_before: Array, bearings_after: Array) -> Array:
 
     Kabsch's solution with Cauchy weights, five rounds; what moves otherwise (near points, water) is outvoted.
     """
-    weights = np.ones(len(bearings_before))
-    rotation = np.eye(3)
-    if len(weights) < 2:
-        return rotation
-    for _ in range(5):
-        rotation = so3.nearest_rotation((bearings_after * weights[:, None]).T @ bearings_before)
-        error = np.linalg.norm(bearings_after - bearings_before @ rotation.T, axis=1)
-        scale = max(1.4826 * float(np.median(error)), _MIN_ANGLE)
-        weights = 1.0 / (1.0 + (error / scale) ** 2)
+    if len(bearings_before) < 2:
+        return np.eye(3)
+    return np.asarray(_kabsch(np.ascontiguousarray(bearings_before), np.ascontiguousarray(bearings_after)))
+
+
+@njit(cache=True, nogil=True)
+def _kabsch(before: Array, after: Array) -> Array:
+    weights, error, rotation = np.ones(len(before)), np.empty(len(before)), np.eye(3)
+    for _ in range(_ROUNDS):
+        moment = np.zeros((3, 3))
+        for n in range(len(before)):
+            for i in range(3):
+                for j in range(3):
+                    moment[i, j] += weights[n] * after[n, i] * before[n, j]
+        u, _, vt = np.linalg.svd(moment)
+        u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)
+        rotation = u @ vt
+        for n in range(len(before)):
+            squared = 0.0
+            for i in range(3):
+                seen = (
+                    rotation[i, 0] * before[n, 0]
+                    + rotation[i, 1] * before[n, 1]
+                    + rotation[i, 2] * before[n, 2]
+                )
+                squared += (after[n, i] - seen) ** 2
+            error[n] = sqrt(squared)
+        scale = max(1.4826 * np.median(error), _MIN_ANGLE)
+        for n in range(len(before)):
+            weights[n] = 1.0 / (1.0 + (error[n] / scale) ** 2)
     return rotation
 
 

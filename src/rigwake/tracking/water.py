@@ -52,7 +52,10 @@ class HorizonMask:
 
     def _full_size(self, half: NDArray[Any]) -> NDArray[Any]:
         height, width = self._shape
-        return np.repeat(np.repeat(half, 2, axis=0), 2, axis=1)[:height, :width]
+        whole = (2 * half.shape[1], 2 * half.shape[0])
+        values = half.view(np.uint8) if half.dtype == np.bool_ else half  # cv2 knows no booleans
+        full = cv2.resize(values, whole, interpolation=cv2.INTER_NEAREST)
+        return np.asarray(full[:height, :width]).view(half.dtype)
 
     def sky(self, image: Image, up_cam: Array) -> Mask:
         """(H, W), True where smooth image above the horizon reaches up to the zenith or the image's edge.
