@@ -254,11 +254,10 @@ def cylinder(frames: int = 50) -> None:
     }
     for title, settings in cases.items():
         scene = replace(turning_scene(frames, **settings), model=fisheye(640, 480))
-        stream, up_cam = scene.stream(), np.full((frames, 3), np.nan)
-        level = np.tile([0.0, 0.0, -1e-9], (frames, 1))  # no direction is below: the whole image is used
+        stream, up_cam = scene.stream(), np.full((frames, 3), np.nan)  # no horizon: the whole image is used
         results = {}
         for name, method in METHODS.items():
-            tracks = method(stream, level if method is frame_to_frame else up_cam)
+            tracks = method(stream, up_cam)
             errors = cylinder_errors(tracks, scene)
             results[name] = (errors, len(errors.age_s) / frames)
         print_errors(f"cylinder, {title}", results)
