@@ -16,14 +16,16 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
+from rigwake.geometry.so3 import Array, hat
 from rigwake.handeye import noise_kernels, normal_kernels
+from rigwake.handeye.lever_arm import TRANSLATION_FLOOR, levels_by_lever_arm
 from rigwake.handeye.resample import Curve
 
 ROTATION_FLOOR = 1e-9  # rad; nothing is known better than rounding allows
-TRANSLATION_FLOOR = 1e-9  # m
 FLOOR = np.repeat([ROTATION_FLOOR**2, TRANSLATION_FLOOR**2], 3)
 OUTLIER_PROBABILITY = 1e-3
+_ENOUGH_COMMON = 30  # steps of two members, to tell what they share
+_Pairs = list[tuple[int, int, NDArray[np.bool_]]]
 _CHI2_MEDIAN, _CHI2_LIMIT = float(chi2.ppf(0.5, 3)), float(chi2.ppf(1 - OUTLIER_PROBABILITY, 3))
 
 
@@ -64,22 +66,29 @@ def learnt_noise(
     Each trajectory gets a covariance (3, 3) for rotation and one for translation. With `by_axis` they are
     free (a camera before a board knows its roll several times better than its tilt), else the same for all
     axes: errors of odometry grow with the motion (a wrong scale, a misaligned gyroscope), a free covariance
-    would take them for noise and bend the estimate after them. One member cannot tell whose error it is:
-    then both sides are equally noisy.
+    would take them for noise and bend the estimate after them. Whose errors they are is told by what members
+    share; with one member by the lever arm, for rotations, while translations count half for each side.
     """
     R, t = np.array([X.rotation for X in mountings]), np.array([X.translation for X in mountings])
     found = noise_kernels.learnt_covariances(
-        R, t, residuals, known, by_axis, ROTATION_FLOOR**2, _CHI2_MEDIAN, _CHI2_LIMIT
+        residuals, known, by_axis, ROTATION_FLOOR**2, _CHI2_MEDIAN, _CHI2_LIMIT
     )
-    found[:, 1] = _positive(found[:, 1]) if by_axis else _positive_levels(found[:, 1])
-    shares = np.array([_shares_of_reference(residuals, known, mountings, first) for first in (0, 3)])
+    shares, pairs = np.full((2, len(R)), 0.5), _pairs(known)
+    turn = _shared_rotation(residuals, mountings, pairs)
+    for m, X in enumerate(mountings):
+        r, arm = residuals[known[:, m], 6 * m : 6 * m + 6], X.inverse().translation
+        told = _share(turn, found[m, 0], 0.01) if pairs else None
+        levels = levels_by_lever_arm(r, arm, float(np.trace(found[m, 0])) / 3, told)
+        shares[0, m] = levels.share
+        # an error of the reference's rotation moves the member by the lever arm
+        swung = levels.share * hat(arm) @ found[m, 0] @ hat(arm).T
+        found[m, 1] = found[m, 1] - swung if by_axis else levels.translation * np.eye(3)
+    if by_axis:
+        found[:, 1] = _positive(found[:, 1])
+    if pairs:
+        way = _shared_translation(residuals, mountings, pairs, shares[0], turn)
+        shares[1] = [_share(way, own, 0.1) for own in found[:, 1]]
     return StepNoise(*noise_kernels.propagated(R, t, *noise_kernels.split(R, found, shares), FLOOR))
-
-
-def _positive_levels(covariances: Array) -> Array:
-    """Mean variances of (M, 3, 3), not below what rounding allows, on the diagonal."""
-    levels = np.maximum(np.einsum("mii->m", covariances) / 3, 0.0) + TRANSLATION_FLOOR**2
-    return np.asarray(levels[:, None, None] * np.eye(3))
 
 
 def _positive(covariances: Array) -> Array:
@@ -89,34 +98,60 @@ def _positive(covariances: Array) -> Array:
     return np.asarray((vectors * kept[:, None, :]) @ np.swapaxes(vectors, -1, -2))
 
 
-def _shares_of_reference(
-    residuals: Array, known: NDArray[np.bool_], mountings: Sequence[SE3], first: int
-) -> Array:
-    """How much of every member's variance (three rows from `first`) is the reference's: what two share."""
-    if len(mountings) == 1:
-        return np.full(1, 0.5)
-    axes = [residuals[:, 6 * m + first : 6 * m + first + 3] @ X.rotation.T for m, X in enumerate(mountings)]
-    own = [_robust_mean(r, known[:, m]) for m, r in enumerate(axes)]
-    shared = [
-        float(np.mean(np.sum((r * other)[known[:, m] & known[:, n]], axis=1)))
-        for m, r in enumerate(axes)
-        for n, other in enumerate(axes[:m])
-        if (known[:, m] & known[:, n]).sum() > 30
+def _share(shared: float, own: Array, least: float) -> float:
+    """Part of a covariance (3, 3) that is the reference's, from the mean of `r_m . r_n` of pairs of members."""
+    return float(np.clip(shared / max(float(np.trace(own)), 1e-300), least, 1 - least))
+
+
+def _pairs(known: NDArray[np.bool_]) -> _Pairs:
+    """Members m > n with more than `_ENOUGH_COMMON` common steps, and which those are."""
+    both = ((m, n, known[:, m] & known[:, n]) for m in range(known.shape[1]) for n in range(m))
+    return [pair for pair in both if pair[2].sum() > _ENOUGH_COMMON]
+
+
+def _shared_rotation(residuals: Array, mountings: Sequence[SE3], pairs: _Pairs) -> float:
+    """Mean of `r_R,m . r_R,n` over pairs of members, in the axes of the reference: its |a_R|^2."""
+    rows = [residuals[:, 6 * m : 6 * m + 3] @ X.rotation.T for m, X in enumerate(mountings)]
+    return _mean_product(rows, np.zeros((len(rows), 3)), pairs)
+
+
+def _shared_translation(
+    residuals: Array, mountings: Sequence[SE3], pairs: _Pairs, shares: Array, turn: float
+) -> float:
+    """The same of translations, less what the reference's rotation, `turn` its |a_R|^2, moves both by.
+
+    Most of that is what the share of the rotation residuals explains, and is taken off each member first.
+    """
+    rows, left = [], []
+    for m, (X, share) in enumerate(zip(mountings, shares, strict=True)):
+        r = residuals[:, 6 * m : 6 * m + 6]
+        rows.append((r[:, 3:] - share * np.cross(X.inverse().translation, r[:, :3])) @ X.rotation.T)
+        left.append((1 - share) * X.translation)
+    return _mean_product(rows, np.array(left), pairs, 2 / 3 * turn)
+
+
+def _mean_product(rows: Sequence[Array], arms: Array, pairs: _Pairs, by_arms: float = 0.0) -> float:
+    """Mean of `row_m . row_n - by_arms arm_m . arm_n` over pairs, outliers pulled in; 0 without pairs."""
+    products = [
+        float(np.mean(np.sum(_pulled_in(rows[m][both]) * _pulled_in(rows[n][both]), axis=1)))
+        - by_arms * float(arms[m] @ arms[n])
+        for m, n, both in pairs
     ]
-    if not shared:
-        return np.full(len(mountings), 0.5)
-    return np.clip(np.mean(shared) / np.maximum(own, 1e-300), 0.1, 0.9)
+    return float(np.mean(products)) if products else 0.0
 
 
-def _robust_mean(rows: Array, known: NDArray[np.bool_], first: int = 0) -> float:
-    """Mean of `|r|^2` (three Gaussian columns from `first` on) with the outliers pulled in: starts from the median."""
-    squared = noise_kernels.squared_lengths(rows, known, first)
-    return float(noise_kernels.robust_mean(squared, _CHI2_MEDIAN, _CHI2_LIMIT))
+def _pulled_in(rows: Array) -> Array:
+    """Rows (N, 3) with outliers shortened to where they begin."""
+    squared = np.sum(rows**2, axis=1)
+    farthest = np.median(squared) / _CHI2_MEDIAN * _CHI2_LIMIT
+    return np.asarray(rows * np.sqrt(np.minimum(1.0, farthest / np.maximum(squared, 1e-300)))[:, None])
 
 
 def robust_mean_square(rows: Array, known: NDArray[np.bool_], first: int) -> float:
-    """Mean of `|r|^2` of three columns of the known rows, outliers pulled in, never below what rounding allows."""
-    return _robust_mean(rows, known, first) + ROTATION_FLOOR**2
+    """Mean of `|r|^2` (three Gaussian columns from `first` on) of the known rows, the outliers pulled in, never
+    below what rounding allows."""
+    squared = noise_kernels.squared_lengths(rows, known, first)
+    return float(noise_kernels.robust_mean(squared, _CHI2_MEDIAN, _CHI2_LIMIT)) + ROTATION_FLOOR**2
 
 
 @cache

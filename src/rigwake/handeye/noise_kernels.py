@@ -61,32 +61,16 @@ def prediction_errors(
 
 @njit(cache=True)
 def learnt_covariances(
-    R: Array,
-    t: Array,
-    rows: Array,
-    known: NDArray[np.bool_],
-    by_axis: bool,
-    floor: float,
-    median_of_unit: float,
-    limit: float,
+    rows: Array, known: NDArray[np.bool_], by_axis: bool, floor: float, median_of_unit: float, limit: float
 ) -> Array:
-    """(M, 2, 3, 3): covariances of rotation and of translation, what the lever arm adds taken off, of residuals
-    (N, 6 M), in the members' axes. See `learnt_noise`."""
-    out, arm, moved = np.empty((len(R), 2, 3, 3)), np.zeros((3, 3)), np.empty((3, 3))
-    for m in range(len(R)):
+    """(M, 2, 3, 3): covariances of rotation and of translation of residuals (N, 6 M); see `learnt_noise`."""
+    count = known.shape[1]
+    out = np.empty((count, 2, 3, 3))
+    for m in range(count):
         valid = known[:, m].copy()
         for part in range(2):
             first = 6 * m + 3 * part
             _robust_covariance(rows, valid, first, by_axis, floor, median_of_unit, limit, out[m, part])
-        for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            along = t[m, 0] * R[m, 0, i] + t[m, 1] * R[m, 1, i] + t[m, 2] * R[m, 2, i]
-            arm[k, j], arm[j, k] = along, -along
-        # an error of the reference's rotation moves the member by the lever arm
-        _sandwich(arm, out[m, 0], moved)
-        for i in range(3):
-            for j in range(3):
-                out[m, 1, i, j] -= moved[i, j] / 2
     return out
 
 

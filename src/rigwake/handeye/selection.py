@@ -50,9 +50,9 @@ def _saturates(problem: HandeyeProblem, estimate: Estimate) -> bool:
         valid = estimate.valid[:, m]
         if not (long.valid.any() and valid.any()):
             return False
-        over_stride = np.mean(residuals(long, mounting)[long.valid] ** 2, axis=0).reshape(2, 3).sum(axis=1)
-        over_step = np.mean(estimate.residuals[m][valid] ** 2, axis=0).reshape(2, 3).sum(axis=1)
-        if np.any(over_stride > _SATURATED * stride * over_step):
+        over_stride = np.mean(residuals(long, mounting)[long.valid] ** 2, axis=0)[:3].sum()
+        over_step = np.mean(estimate.residuals[m][valid] ** 2, axis=0)[:3].sum()
+        if over_stride > _SATURATED * stride * over_step:
             return False
     return True
 

@@ -1,0 +1,164 @@
+"""Whose rotation errors these are: the lever arm between two bodies tells.
+
+An error of the reference's rotation moves the member by the lever arm p (the reference's origin in the member's
+axes), an error of the member's own rotation does not. So a residual `r = [r_R, r_t]` whose rotation variance v is
+to the share s the reference's, and whose translation variance is q by itself, has
+
+    r_t | r_R ~ N(s p x r_R,  q along p,  q + s (1 - s) v |p|^2 across p).
+
+Taking both sides to be equally noisy instead would, with a long arm, leave less than nothing for q where one of
+them is the better.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.stats import chi2
+
+from rigwake.geometry.so3 import Array
+
+_LOGIT_RANGE = 5.0  # shares of 0.7 to 99.3 %
+_COARSE, _FINE = 21, 14  # shares tried, then steps of the golden section
+_SCORINGS = 12  # steps towards the level of one share
+_ROUNDS = 3  # of weights and levels
+_LEAST = 1e-4  # level of translation, of all that moves
+TRANSLATION_FLOOR = 1e-9  # m; nothing is known better than rounding allows
+_MEDIAN = float(chi2.ppf(0.5, 3))
+_LIMIT = float(chi2.ppf(0.999, 6))
+_FAR = 3.0  # times the limit (in deviations) from where on an outlier counts no more than one at it
+_GOLDEN = (math.sqrt(5.0) - 1) / 2
+
+
+@dataclass(frozen=True)
+class LeverArmLevels:
+    """share: part of the rotation's variance that is the reference's. translation: its own variance per axis, m^2."""
+
+    share: float
+    translation: float
+
+
+def levels_by_lever_arm(
+    residuals: Array, arm: Array, rotation: float, share: float | None = None
+) -> LeverArmLevels:
+    """Maximum likelihood of share and translation level, under the loss of the estimate itself.
+
+    residuals: (N, 6). arm: (3,) p in metres. rotation: v, rad^2 per axis. share: if known from elsewhere.
+    A weak prior, Beta(2, 2), decides where the arm is too short to tell. Outliers weigh as in Huber's loss up to
+    `_FAR` times its limit, beyond that they count no more.
+    """
+    given = -1.0 if share is None else share
+    found, level = _levels(
+        np.ascontiguousarray(residuals), np.asarray(arm, dtype=np.float64), rotation, given
+    )
+    return LeverArmLevels(float(found), float(level))
+
+
+@njit(cache=True)
+def _levels(residuals: Array, arm: Array, v: float, given: float) -> tuple[float, float]:
+    squares = _squares(residuals, arm)
+    length2 = arm[0] * arm[0] + arm[1] * arm[1] + arm[2] * arm[2]
+    # before anything is known an outlier is far by rotation, or by all of its translation
+    moved = squares[:, 1] + squares[:, 2]
+    typical = np.median(moved) / _MEDIAN if len(moved) else 1.0
+    share, q, swing = 0.5, typical + TRANSLATION_FLOOR**2, 0.0
+    for _ in range(_ROUNDS):
+        across_variance = q + share * (1 - share) * swing
+        sums = np.zeros(5)
+        for k in range(len(squares)):
+            turned, along, across, common, swung = squares[k]
+            d = turned / v + along / q
+            d += (across - 2 * share * common + share * share * swung) / across_variance
+            u = _weight(d)
+            for j in range(5):
+                sums[j] += u * squares[k, j]
+        means = sums / max(len(squares), 1)
+        swing = v * length2
+        if given >= 0:
+            share, q = given, _level(given, means, swing)
+        else:
+            share, q = _best_share(means, swing, len(squares))
+    return share, q
+
+
+@njit(cache=True)
+def _squares(residuals: Array, arm: Array) -> Array:
+    """(N, 5) of every residual: |r_R|^2, r_t^2 along the arm, across it, (p x r_R) . r_t, |p x r_R|^2."""
+    length = math.sqrt(arm[0] * arm[0] + arm[1] * arm[1] + arm[2] * arm[2])
+    axis = arm / length if length > 0 else np.array([1.0, 0.0, 0.0])
+    out = np.empty((len(residuals), 5))
+    for k in range(len(residuals)):
+        r = residuals[k]
+        x, y, z = (
+            arm[1] * r[2] - arm[2] * r[1],
+            arm[2] * r[0] - arm[0] * r[2],
+            arm[0] * r[1] - arm[1] * r[0],
+        )
+        along = (axis[0] * r[3] + axis[1] * r[4] + axis[2] * r[5]) ** 2
+        out[k, 0] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
+        out[k, 1] = along
+        out[k, 2] = r[3] * r[3] + r[4] * r[4] + r[5] * r[5] - along
+        out[k, 3] = x * r[3] + y * r[4] + z * r[5]
+        out[k, 4] = x * x + y * y + z * z
+    return out
+
+
+@njit(cache=True)
+def _weight(squared: float) -> float:
+    """Huber's weight of a residual in a covariance, falling faster beyond `_FAR` times the limit."""
+    ratio = _LIMIT / max(squared, 1e-300)
+    if ratio >= 1:
+        return 1.0
+    return math.sqrt(ratio) if ratio * _FAR * _FAR > 1 else _FAR * ratio
+
+
+@njit(cache=True)
+def _across(share: float, means: Array) -> float:
+    """Mean square per axis across the arm of what the share leaves."""
+    return (means[2] - 2 * share * means[3] + share * share * means[4]) / 2
+
+
+@njit(cache=True)
+def _level(share: float, means: Array, swing: float) -> float:
+    """q that maximises the likelihood, by Fisher scoring."""
+    least = _LEAST * (means[1] + means[2]) + TRANSLATION_FLOOR**2
+    extra, across = share * (1 - share) * swing, _across(share, means)
+    q = max(means[1], least)
+    for _ in range(_SCORINGS):
+        a, b = 1 / (q * q), 2 / (q + extra) ** 2
+        q = max((a * means[1] + b * (across - extra)) / (a + b), least)
+    return q
+
+
+@njit(cache=True)
+def _cost(logit: float, means: Array, swing: float, count: int) -> float:
+    """Minus twice the logarithm of the likelihood and the prior per residual, at the best q."""
+    share = 1 / (1 + math.exp(-logit))
+    q = _level(share, means, swing)
+    wide = q + share * (1 - share) * swing
+    cost = math.log(q) + means[1] / q + 2 * math.log(wide) + 2 * _across(share, means) / wide
+    return cost - 2 * math.log(share * (1 - share)) / max(count, 1)
+
+
+@njit(cache=True)
+def _best_share(means: Array, swing: float, count: int) -> tuple[float, float]:
+    """Share and q: the best of a grid, then the golden section about it, so that nothing jumps."""
+    step = 2 * _LOGIT_RANGE / (_COARSE - 1)
+    best, lowest = 0.0, math.inf
+    for k in range(_COARSE):
+        logit = k * step - _LOGIT_RANGE
+        cost = _cost(logit, means, swing, count)
+        if cost < lowest:
+            best, lowest = logit, cost
+    low, high = best - step, best + step
+    for _ in range(_FINE):
+        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        if _cost(left, means, swing, count) < _cost(right, means, swing, count):
+            high = right
+        else:
+            low = left
+    share = 1 / (1 + math.exp(-(low + high) / 2))
+    return share, _level(share, means, swing)
