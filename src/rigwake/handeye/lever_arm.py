@@ -22,7 +22,8 @@ from scipy.stats import chi2
 from rigwake.geometry.so3 import Array
 
 _LOGIT_RANGE = 5.0  # shares of 0.7 to 99.3 %
-_COARSE, _FINE = 21, 14  # shares tried, then steps of the golden section
+_COARSE, _FINE = 11, 14  # shares tried, then steps of the golden section
+_STEP = 2 * _LOGIT_RANGE / (_COARSE - 1)
 _SCORINGS = 12  # steps towards the level of one share
 _ROUNDS = 3  # of weights and levels
 _LEAST = 1e-4  # level of translation, of all that moves
@@ -64,23 +65,16 @@ def _levels(residuals: Array, arm: Array, v: float, given: float) -> tuple[float
     # before anything is known an outlier is far by rotation, or by all of its translation
     moved = squares[:, 1] + squares[:, 2]
     typical = np.median(moved) / _MEDIAN if len(moved) else 1.0
-    share, q, swing = 0.5, typical + TRANSLATION_FLOOR**2, 0.0
+    share, q, swing, means = 0.5, typical + TRANSLATION_FLOOR**2, 0.0, np.zeros(5)
     for _ in range(_ROUNDS):
-        across_variance = q + share * (1 - share) * swing
-        sums = np.zeros(5)
-        for k in range(len(squares)):
-            turned, along, across, common, swung = squares[k]
-            d = turned / v + along / q
-            d += (across - 2 * share * common + share * share * swung) / across_variance
-            u = _weight(d)
-            for j in range(5):
-                sums[j] += u * squares[k, j]
-        means = sums / max(len(squares), 1)
+        means = _weighted_means(squares, share, v, q, q + share * (1 - share) * swing)
         swing = v * length2
-        if given >= 0:
-            share, q = given, _level(given, means, swing)
-        else:
-            share, q = _best_share(means, swing, len(squares))
+        share = given if given >= 0 else _share_of(_best_logit(means, swing, len(squares)))
+        q = _level(share, means, swing)
+    if given < 0:
+        logit = math.log(share / (1 - share))
+        share = _share_of(_refined(logit, means, swing, len(squares)))
+        q = _level(share, means, swing)
     return share, q
 
 
@@ -104,6 +98,18 @@ def _squares(residuals: Array, arm: Array) -> Array:
         out[k, 3] = x * r[3] + y * r[4] + z * r[5]
         out[k, 4] = x * x + y * y + z * z
     return out
+
+
+@njit(cache=True)
+def _weighted_means(squares: Array, share: float, turned: float, along: float, across: float) -> Array:
+    """(5,) means over the residuals, outliers of these variances weighing less."""
+    sums = np.zeros(5)
+    for k in range(len(squares)):
+        moved = squares[k, 2] - 2 * share * squares[k, 3] + share * share * squares[k, 4]
+        weight = _weight(squares[k, 0] / turned + squares[k, 1] / along + moved / across)
+        for j in range(5):
+            sums[j] += weight * squares[k, j]
+    return sums / max(len(squares), 1)
 
 
 @njit(cache=True)
@@ -136,7 +142,7 @@ def _level(share: float, means: Array, swing: float) -> float:
 @njit(cache=True)
 def _cost(logit: float, means: Array, swing: float, count: int) -> float:
     """Minus twice the logarithm of the likelihood and the prior per residual, at the best q."""
-    share = 1 / (1 + math.exp(-logit))
+    share = _share_of(logit)
     q = _level(share, means, swing)
     wide = q + share * (1 - share) * swing
     cost = math.log(q) + means[1] / q + 2 * math.log(wide) + 2 * _across(share, means) / wide
@@ -144,21 +150,35 @@ def _cost(logit: float, means: Array, swing: float, count: int) -> float:
 
 
 @njit(cache=True)
-def _best_share(means: Array, swing: float, count: int) -> tuple[float, float]:
-    """Share and q: the best of a grid, then the golden section about it, so that nothing jumps."""
-    step = 2 * _LOGIT_RANGE / (_COARSE - 1)
+def _best_logit(means: Array, swing: float, count: int) -> float:
+    """The best of a grid of shares."""
     best, lowest = 0.0, math.inf
     for k in range(_COARSE):
-        logit = k * step - _LOGIT_RANGE
+        logit = k * _STEP - _LOGIT_RANGE
         cost = _cost(logit, means, swing, count)
         if cost < lowest:
             best, lowest = logit, cost
-    low, high = best - step, best + step
+    return best
+
+
+@njit(cache=True)
+def _refined(logit: float, means: Array, swing: float, count: int) -> float:
+    """Golden section about a value of the grid, so that the share does not jump when the residuals hardly move."""
+    low, high = logit - _STEP, logit + _STEP
+    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    at_left, at_right = _cost(left, means, swing, count), _cost(right, means, swing, count)
     for _ in range(_FINE):
-        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        if _cost(left, means, swing, count) < _cost(right, means, swing, count):
-            high = right
+        if at_left < at_right:
+            high, right, at_right = right, left, at_left
+            left = high - _GOLDEN * (high - low)
+            at_left = _cost(left, means, swing, count)
         else:
-            low = left
-    share = 1 / (1 + math.exp(-(low + high) / 2))
-    return share, _level(share, means, swing)
+            low, left, at_left = left, right, at_right
+            right = low + _GOLDEN * (high - low)
+            at_right = _cost(right, means, swing, count)
+    return (low + high) / 2
+
+
+@njit(cache=True)
+def _share_of(logit: float) -> float:
+    return 1 / (1 + math.exp(-logit))

@@ -76,26 +76,25 @@ def learnt_noise(
     shares, pairs = np.full((2, len(R)), 0.5), _pairs(known)
     turn = _shared_rotation(residuals, mountings, pairs)
     for m, X in enumerate(mountings):
-        r, arm = residuals[known[:, m], 6 * m : 6 * m + 6], X.inverse().translation
+        r, arm = residuals[known[:, m], 6 * m : 6 * m + 6], -X.translation @ X.rotation
         told = _share(turn, found[m, 0], 0.01) if pairs else None
         levels = levels_by_lever_arm(r, arm, float(np.trace(found[m, 0])) / 3, told)
         shares[0, m] = levels.share
-        # an error of the reference's rotation moves the member by the lever arm
-        swung = levels.share * hat(arm) @ found[m, 0] @ hat(arm).T
-        found[m, 1] = found[m, 1] - swung if by_axis else levels.translation * np.eye(3)
-    if by_axis:
-        found[:, 1] = _positive(found[:, 1])
+        if by_axis:  # an error of the reference's rotation moves the member by the lever arm
+            found[m, 1] = _positive(found[m, 1] - levels.share * hat(arm) @ found[m, 0] @ hat(arm).T)
+        else:
+            found[m, 1] = np.diag(np.full(3, levels.translation))
     if pairs:
         way = _shared_translation(residuals, mountings, pairs, shares[0], turn)
         shares[1] = [_share(way, own, 0.1) for own in found[:, 1]]
     return StepNoise(*noise_kernels.propagated(R, t, *noise_kernels.split(R, found, shares), FLOOR))
 
 
-def _positive(covariances: Array) -> Array:
-    """(M, 3, 3) with no direction below a twentieth of the widest."""
-    values, vectors = np.linalg.eigh(covariances)
-    kept = np.maximum(values, 0.05 * np.maximum(values[:, 2:], 0.0) + TRANSLATION_FLOOR**2)
-    return np.asarray((vectors * kept[:, None, :]) @ np.swapaxes(vectors, -1, -2))
+def _positive(covariance: Array) -> Array:
+    """(3, 3) with no direction below a twentieth of the widest."""
+    values, vectors = np.linalg.eigh(covariance)
+    kept = np.maximum(values, 0.05 * max(values[-1], 0.0) + TRANSLATION_FLOOR**2)
+    return np.asarray((vectors * kept) @ vectors.T)
 
 
 def _share(shared: float, own: Array, least: float) -> float:

@@ -2,7 +2,8 @@
 
 Drift and jitter look alike from one step to the next if jitter lasts for a while. Over long strides they part:
 the variance of `log(B^-1 X^-1 A X)` grows with the stride where trajectories drift, and stays where every pose
-is fixed by itself (a board, GNSS), whatever the memory of its errors.
+is fixed by itself (a board, GNSS), whatever the memory of its errors. Only that of its rotation is looked at over
+long strides: a rotation that jitters moves the end of a stride by the way sailed.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def without_drift(
 
 
 def _saturates(problem: HandeyeProblem, estimate: Estimate) -> bool:
-    """Whether errors over a long stride are smaller than those of its steps would add up to."""
+    """Whether rotations err less over a long stride than the errors of its steps would add up to."""
     stride = max(2, len(estimate.valid) // _STRIDES)
     reference, sampled = problem.sampled(estimate.mountings)
     for m, (member, mounting) in enumerate(zip(sampled, estimate.mountings, strict=True)):
