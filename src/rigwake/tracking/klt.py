@@ -12,6 +12,7 @@ from math import floor, sqrt
 import cv2
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from rigwake.cameras.base import Mask
@@ -22,6 +23,7 @@ from rigwake.threads import over_ranges, ranges
 Pyramid = tuple[NDArray[np.float32], ...]
 """An image and its halves, quarters, ..., each with a margin around it, mirrored."""
 
+SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}  # pixels may still be NaN
 _LEAST_POINTS = 50  # that are worth a thread
 _MOST_STEPS = 12
 _CONVERGED_PX = 0.03
@@ -80,7 +82,9 @@ def _lucas_kanade(
         _search(before[level], after[level], start, landed, found, 0.5**level, level == 0, window_px, padded)
 
 
-@njit(cache=True, nogil=True)
+# What it calls is inlined: a function of its own has two copies, one of them optimised again inside its caller, and
+# which one runs would differ between the process that compiles and those that load, by a rounding of sums.
+@njit(cache=True, nogil=True, fastmath=SUMS_IN_ANY_ORDER)
 def _search(  # type: ignore[no-untyped-def]
     before, after, start, landed, found, scale, finest, window_px, padded
 ):
@@ -119,7 +123,7 @@ def _search(  # type: ignore[no-untyped-def]
         landed[n, 0], landed[n, 1] = (x + reach - margin) / scale, (y + reach - margin) / scale
 
 
-@njit(cache=True, nogil=True)
+@register_jitable(inline="always")
 def _interpolate(image, x, y, out):  # type: ignore[no-untyped-def]
     """Bilinear samples from (x, y) on, at steps of one pixel; False if they leave the image."""
     height, width = out.shape
@@ -136,7 +140,7 @@ def _interpolate(image, x, y, out):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@register_jitable(inline="always")
 def _slopes(wider, window, by_x, by_y):  # type: ignore[no-untyped-def]
     """The window inside a `wider` one, its derivatives (Scharr's filter), and the sums of their products."""
     size = len(window)
@@ -157,7 +161,7 @@ def _slopes(wider, window, by_x, by_y):  # type: ignore[no-untyped-def]
     return float(xx), float(xy), float(yy)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@register_jitable(inline="always")
 def _pull(image, x, y, window, by_x, by_y):  # type: ignore[no-untyped-def]
     """Sums of (image - window) times the window's derivatives, with the window laid at (x, y), and whether that is
     inside the image."""

@@ -25,6 +25,7 @@ from rigwake.cameras.base import Mask
 from rigwake.geometry.so3 import Array
 from rigwake.threads import over_ranges, ranges
 from rigwake.tracking.interpolation import Coefficients, sample, sample_with_gradient
+from rigwake.tracking.klt import SUMS_IN_ANY_ORDER
 from rigwake.tracking.small_solve import cholesky_solve, position_spread
 
 Floats = NDArray[np.float32]
@@ -256,7 +257,8 @@ def _orthonormalise(basis: Array) -> float:
     return norm
 
 
-@njit(cache=True, nogil=True)
+# what it calls is inlined for the reason given in `klt.py`
+@njit(cache=True, nogil=True, fastmath=SUMS_IN_ANY_ORDER)
 def _register(  # type: ignore[no-untyped-def]
     first, last, coefficients, pattern, information, contrast, offsets, root_weights, lower_right, lower_left,
     warp_precision, max_shift_px, iterations, pixels, warps, found, correlation, variance, spread, lag_sums,
@@ -292,7 +294,7 @@ def _register(  # type: ignore[no-untyped-def]
         found[n] = found[n] and spread[n] > 0
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@register_jitable(inline="always")
 def _correlate(
     coefficients: Coefficients,
     pattern: Floats,
@@ -330,7 +332,7 @@ def _correlate(
     return max(float(power), 0.0)
 
 
-@register_jitable
+@register_jitable(inline="always")
 def _normal_equations(
     gain: float, information: Array, sums: Floats, weight: float, strayed: Array, matrix: Array, step: Array
 ) -> None:
@@ -344,14 +346,14 @@ def _normal_equations(
         step[2 + i] += weight * (strayed[i // 2, i % 2] - (1.0 if i in (0, 3) else 0.0))
 
 
-@register_jitable
+@register_jitable(inline="always")
 def _inverse(a: Array) -> Array:
     """Of a 2x2 matrix: for so few numbers a call of LAPACK costs more than the work."""
     determinant = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
     return np.array([[a[1, 1], -a[0, 1]], [-a[1, 0], a[0, 0]]]) / determinant
 
 
-@register_jitable
+@register_jitable(inline="always")
 def _product(a: Array, b: Array) -> Array:
     """Of two 2x2 matrices."""
     out = np.empty((2, 2))
@@ -361,7 +363,7 @@ def _product(a: Array, b: Array) -> Array:
     return out
 
 
-@register_jitable
+@register_jitable(inline="always")
 def _step(matrix: Array, step: Array, pixel: Array, warp: Array) -> float:
     """Solve for the template's increment and compose its inverse with the warp (in place); pixels moved,
     negative if it cannot be done. `matrix` is left as its Cholesky factor."""
@@ -379,7 +381,7 @@ def _step(matrix: Array, step: Array, pixel: Array, warp: Array) -> float:
     return sqrt(dx * dx + dy * dy)
 
 
-@register_jitable
+@register_jitable(inline="always")
 def _neighbour_products(
     values: Floats,
     pattern: Floats,

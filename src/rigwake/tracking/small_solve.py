@@ -10,7 +10,7 @@ from numba.extending import register_jitable
 from rigwake.geometry.so3 import Array
 
 
-@register_jitable
+@register_jitable(inline="always")
 def cholesky_solve(matrix: Array, right_side: Array) -> bool:
     """Solve in place by L L^T, leaving L in the lower half; False if not positive definite."""
     n = len(right_side)
@@ -35,7 +35,7 @@ def cholesky_solve(matrix: Array, right_side: Array) -> bool:
     return True
 
 
-@register_jitable
+@register_jitable(inline="always")
 def position_spread(factor: Array) -> float:
     """Mean of the first two diagonal entries of `(L L^T)^-1`."""
     total = 0.0
