@@ -40,6 +40,7 @@ from rigwake.handeye.problem import HandeyeProblem, step_covariances
 from rigwake.handeye.values import HandeyeOptions
 
 _MOVES_LESS = 1e-3  # of a standard deviation: converged
+_JUDGED = 1.0  # standard deviations from its end: near enough to compare with another model
 _SETTLED = 0.3  # of a standard deviation: near enough to learn the noise from the residuals
 _PATIENCE = 15  # steps
 _LONGEST_TURN, _LONGEST_WAY = 0.5, 20.0  # radians, metres in one step
@@ -131,22 +132,25 @@ def maximise(
     options: HandeyeOptions,
     worthwhile: Callable[[Estimate], bool] | None = None,
 ) -> Estimate:
-    """Gauss-Newton from `start` until a step moves nothing by more than a thousandth of its deviation.
+    """Gauss-Newton from `start` until the next step would move nothing by more than a thousandth of its deviation.
 
-    worthwhile: asked once, when steps are down to 0.3 deviations; unless it is, the estimate is left there.
+    The next step is expected to be shorter than this one as this one is than the last.
+
+    worthwhile: asked once, when steps are down to one deviation; unless it is, the estimate is left there.
     """
     solver = _Solver(problem, start, options)
     learning = problem.noise == "estimated"
     doubt = doubt_of(problem, int(solver.valid.any(axis=1).sum()))
-    moved, iterations, settled, enough = np.inf, 0, not learning, _MOVES_LESS
-    while (moved > enough or not settled) and iterations < options.max_iterations:
+    moved, ahead, iterations, settled, enough = np.inf, np.inf, 0, not learning, _MOVES_LESS
+    while (ahead > enough or not settled) and iterations < options.max_iterations:
         if learning and moved < _SETTLED:
             solver.learn_filters()
             settled = True
-        moved = solver.step(doubt)
+        before, moved = moved, solver.step(doubt)
+        ahead = moved * min(1.0, moved / before) if 0 < before < np.inf else moved
         iterations += 1
-        if worthwhile is not None and moved < _SETTLED:
-            so_far = solver.estimate(doubt, iterations, converged=moved <= enough)
+        if worthwhile is not None and moved < _JUDGED:
+            so_far = solver.estimate(doubt, iterations, converged=ahead <= enough)
             if not worthwhile(so_far):
                 return so_far
             worthwhile = None
@@ -154,9 +158,9 @@ def maximise(
             # what comes and goes with every step is on the edge: a direction of being determined (give it
             # up), a pose of the shared time (it moves the estimate by little)
             doubt, enough = 2 * doubt, 10 * enough
-    if moved > enough:
+    if ahead > enough:
         solver.latest = solver.equations()
-    return solver.estimate(doubt, iterations, converged=moved <= enough)
+    return solver.estimate(doubt, iterations, converged=ahead <= enough)
 
 
 def information_criterion(problem: HandeyeProblem, estimate: Estimate) -> float:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array, hat
+from rigwake.geometry.so3 import Array
 from rigwake.handeye import noise_kernels, normal_kernels
 from rigwake.handeye.lever_arm import TRANSLATION_FLOOR, levels_by_lever_arm
 from rigwake.handeye.resample import Curve
@@ -24,6 +24,7 @@ from rigwake.handeye.resample import Curve
 ROTATION_FLOOR = 1e-9  # rad; nothing is known better than rounding allows
 FLOOR = np.repeat([ROTATION_FLOOR**2, TRANSLATION_FLOOR**2], 3)
 OUTLIER_PROBABILITY = 1e-3
+_UNIT = np.eye(3)
 _ENOUGH_COMMON = 30  # steps of two members, to tell what they share
 _Pairs = list[tuple[int, int, NDArray[np.bool_]]]
 _CHI2_MEDIAN, _CHI2_LIMIT = float(chi2.ppf(0.5, 3)), float(chi2.ppf(1 - OUTLIER_PROBABILITY, 3))
@@ -74,27 +75,21 @@ def learnt_noise(
         residuals, known, by_axis, ROTATION_FLOOR**2, _CHI2_MEDIAN, _CHI2_LIMIT
     )
     shares, pairs = np.full((2, len(R)), 0.5), _pairs(known)
-    turn = _shared_rotation(residuals, mountings, pairs)
+    turn = _shared_rotation(residuals, mountings, pairs) if pairs else 0.0
     for m, X in enumerate(mountings):
         r, arm = residuals[known[:, m], 6 * m : 6 * m + 6], -X.translation @ X.rotation
         told = _share(turn, found[m, 0], 0.01) if pairs else None
         levels = levels_by_lever_arm(r, arm, float(np.trace(found[m, 0])) / 3, told)
         shares[0, m] = levels.share
-        if by_axis:  # an error of the reference's rotation moves the member by the lever arm
-            found[m, 1] = _positive(found[m, 1] - levels.share * hat(arm) @ found[m, 0] @ hat(arm).T)
-        else:
-            found[m, 1] = np.diag(np.full(3, levels.translation))
+        found[m, 1] = (
+            noise_kernels.without_swing(found[m, 1], found[m, 0], arm, levels.share, TRANSLATION_FLOOR**2)
+            if by_axis
+            else levels.translation * _UNIT
+        )
     if pairs:
         way = _shared_translation(residuals, mountings, pairs, shares[0], turn)
         shares[1] = [_share(way, own, 0.1) for own in found[:, 1]]
     return StepNoise(*noise_kernels.propagated(R, t, *noise_kernels.split(R, found, shares), FLOOR))
-
-
-def _positive(covariance: Array) -> Array:
-    """(3, 3) with no direction below a twentieth of the widest."""
-    values, vectors = np.linalg.eigh(covariance)
-    kept = np.maximum(values, 0.05 * max(values[-1], 0.0) + TRANSLATION_FLOOR**2)
-    return np.asarray((vectors * kept) @ vectors.T)
 
 
 def _share(shared: float, own: Array, least: float) -> float:
@@ -130,13 +125,13 @@ def _shared_translation(
 
 
 def _mean_product(rows: Sequence[Array], arms: Array, pairs: _Pairs, by_arms: float = 0.0) -> float:
-    """Mean of `row_m . row_n - by_arms arm_m . arm_n` over pairs, outliers pulled in; 0 without pairs."""
+    """Mean of `row_m . row_n - by_arms arm_m . arm_n` over pairs, outliers pulled in."""
     products = [
         float(np.mean(np.sum(_pulled_in(rows[m][both]) * _pulled_in(rows[n][both]), axis=1)))
         - by_arms * float(arms[m] @ arms[n])
         for m, n, both in pairs
     ]
-    return float(np.mean(products)) if products else 0.0
+    return float(np.mean(products))
 
 
 def _pulled_in(rows: Array) -> Array:

@@ -75,6 +75,24 @@ def learnt_covariances(
 
 
 @njit(cache=True)
+def without_swing(moved: Array, turned: Array, arm: Array, share: float, floor: float) -> Array:
+    """Covariance (3, 3) of translations less what the share of the rotations' moves the arm by; no direction below
+    a twentieth of the widest."""
+    turn, swung, out = np.zeros((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        turn[k, j], turn[j, k] = arm[i], -arm[i]
+    _sandwich(turn, turned, swung)
+    values, vectors = np.linalg.eigh(moved - share * swung)
+    least = 0.05 * max(values[2], 0.0) + floor
+    for c in range(3):
+        for i in range(3):
+            for j in range(3):
+                out[i, j] += max(values[c], least) * vectors[i, c] * vectors[j, c]
+    return out
+
+
+@njit(cache=True)
 def _sandwich(A: Array, covariance: Array, out: Array) -> None:
     """`out = A covariance A^T`, in loops: small, and quicker to compile than calls of BLAS."""
     p, q = A.shape
