@@ -4,7 +4,8 @@ import numpy as np
 
 from rigwake.geometry.so3 import Array
 from rigwake.tracking.interpolation import spline_coefficients
-from rigwake.tracking.registration import PatchShape, drawn_by_bend, make_references, register
+from rigwake.tracking.references import PatchShape, drawn_by_bend, make_references
+from rigwake.tracking.registration import register
 
 SIZE = 40
 CENTRE = np.array([SIZE / 2.0, SIZE / 2.0])

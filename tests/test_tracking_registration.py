@@ -8,7 +8,8 @@ from scipy import ndimage
 
 from rigwake.geometry import so3
 from rigwake.tracking.interpolation import sample, sample_with_gradient, spline_coefficients
-from rigwake.tracking.registration import PatchShape, make_references, register
+from rigwake.tracking.references import PatchShape, make_references
+from rigwake.tracking.registration import register
 from rigwake.tracking.warps import dominant_rotation, rotation_warps, stencil_bearings
 from tracking_scene import fisheye
 

@@ -18,7 +18,8 @@ from rigwake.geometry.so3 import Array
 from rigwake.recording import CameraStream
 from rigwake.threads import over_ranges
 from rigwake.tracking.interpolation import Coefficients, spline_coefficients
-from rigwake.tracking.registration import PatchShape, References, drawn_by_bend, make_references, register
+from rigwake.tracking.references import PatchShape, References, drawn_by_bend, make_references
+from rigwake.tracking.registration import register
 
 _REACH_PX = 2.5  # what one registration can bridge
 

@@ -16,7 +16,8 @@ from rigwake.tracking.interpolation import Coefficients, spline_coefficients
 from rigwake.tracking.klt import Pyramid, follow, pyramid
 from rigwake.tracking.masks import inside
 from rigwake.tracking.options import TrackingOptions
-from rigwake.tracking.registration import PatchShape, References, drawn_by_bend, make_references, register
+from rigwake.tracking.references import PatchShape, References, drawn_by_bend, make_references
+from rigwake.tracking.registration import register
 from rigwake.tracking.warps import dominant_rotation, rotation_warps, stencil_bearings
 
 Observed = tuple[NDArray[np.int64], Array, Array]

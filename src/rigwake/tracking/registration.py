@@ -13,7 +13,7 @@ predicted warp, so that patches which do not show their own deformation follow t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
@@ -24,85 +24,15 @@ from numpy.typing import NDArray
 from rigwake.cameras.base import Mask
 from rigwake.geometry.so3 import Array
 from rigwake.threads import over_ranges, ranges
-from rigwake.tracking.interpolation import Coefficients, sample, sample_with_gradient
+from rigwake.tracking.interpolation import Coefficients, sample
 from rigwake.tracking.klt import SUMS_IN_ANY_ORDER
+from rigwake.tracking.references import PHOTOMETRIC, ROWS, UNKNOWNS, Floats, PatchShape, References
 from rigwake.tracking.small_solve import cholesky_solve, position_spread
 
-Floats = NDArray[np.float32]
-
-_PHOTOMETRIC = 6  # b, b_x, b_y, g_x, g_y, g: the gain itself comes last
-_UNKNOWNS = 6  # two of the position, four of the warp
-_ROWS = _UNKNOWNS + _PHOTOMETRIC
 _MIN_GAIN = 0.05  # a patch with less of its first contrast has gone dark
 _MIN_VARIANCE = 0.25  # grey levels^2: rounding to whole grey levels alone leaves 1/12 in each image
 _LEAST_PATCHES = 50  # that are worth a thread
 _CONVERGED_PX = 0.015  # a step leaves about a fifth of the error: what remains is far below the noise
-
-
-@dataclass(frozen=True, eq=False)
-class PatchShape:
-    """Where a patch is sampled: offsets (K, 2) in pixels and the root of each sample's weight (K,).
-
-    lower_right, lower_left: (K,) index of the neighbouring sample, -1 where there is none.
-    """
-
-    offsets: Floats
-    root_weights: Floats
-    lower_right: NDArray[np.int64]
-    lower_left: NDArray[np.int64]
-
-    @classmethod
-    def disc(cls, radius_px: int) -> PatchShape:
-        """Every other pixel (like the black squares of a chessboard) within `radius_px`, weighted down towards
-        the rim by a Gaussian of that width. A lens blurs more than that spacing; all pixels tell no more."""
-        reach = np.arange(-radius_px, radius_px + 1)
-        y, x = (grid.ravel() for grid in np.meshgrid(reach, reach, indexing="ij"))
-        distance = np.hypot(x, y)
-        kept = (distance <= radius_px + 0.5) & ((x + y) % 2 == 0)
-        x, y, distance = x[kept], y[kept], distance[kept]
-        weight = np.exp(-0.5 * (distance / radius_px) ** 2)
-        index = {(int(i), int(j)): k for k, (i, j) in enumerate(zip(x, y, strict=True))}
-        return cls(
-            np.stack([x, y], axis=1).astype(np.float32),
-            np.sqrt(weight / weight.mean()).astype(np.float32),
-            np.array([index.get((int(i) + 1, int(j) + 1), -1) for i, j in zip(x, y, strict=True)]),
-            np.array([index.get((int(i) - 1, int(j) + 1), -1) for i, j in zip(x, y, strict=True)]),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class References:
-    """Reference patches, prepared: N patches of K samples.
-
-    pattern: (N, 12, K) per sample the weighted derivatives of T by p and A, with the photometric directions
-        projected out, and then these directions (orthonormal; what T adds to the others comes last).
-    information: (N, 6, 6) Gauss-Newton matrix of p and A per unit of gain and noise.
-    contrast: (N,) norm of what T adds to the other photometric directions.
-    pulls: (N, 2, 6) how far the fitted position moves by unit bends of the patch, see `drawn_by_bend`.
-    """
-
-    pattern: Floats
-    information: Array
-    contrast: Array
-    pulls: Array
-
-    def __len__(self) -> int:
-        return len(self.contrast)
-
-    def std_per_noise(self) -> Array:
-        """(N,) standard deviation of a coordinate of the position per grey level of independent noise."""
-        covariance = np.linalg.inv(self.information + np.eye(_UNKNOWNS) * 1e-6)
-        return np.asarray(np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2))
-
-    def take(self, index: Mask) -> References:
-        """The chosen patches."""
-        return References(*(getattr(self, f.name)[index] for f in fields(self)))
-
-    def join(self, other: References) -> References:
-        """These patches, then the other ones."""
-        return References(
-            *(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self))
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,12 +51,6 @@ class Registration:
     correlation: Array
     std_px: Array
     noise: Array
-
-
-def make_references(coefficients: Coefficients, pixels: Array, shape: PatchShape) -> tuple[References, Mask]:
-    """Reference patches about pixels (N, 2), and which of them (N,) lie inside the image and have texture."""
-    made = _make_references(coefficients, pixels, shape.offsets, shape.root_weights)
-    return References(*made[:4]), made[4]
 
 
 def register(
@@ -163,18 +87,6 @@ def register(
     return Registration(pixels, warps, found, correlation, std_px, np.sqrt(variance))
 
 
-def drawn_by_bend(references: References, warps: Array, bends: Array) -> Array:
-    """(N, 2) how far patches are found from where they are, because their warp is bent and an affine one is fitted.
-
-    Perspective and lens move the sample at offset x from the patch's centre by `A x + b(x)`, b quadratic with the
-    second derivatives `bends` (N, 2, 3), by xx, xy and yy. In the patch's own pixels that is `A^-1 b(x)`; with G
-    the slopes of the samples by position and warp, the fit answers with `(G^T G)^-1 G^T g`, g what `A^-1 b` does
-    to them. A tenth of a pixel between cameras that look 90 degrees apart, in the same sense for all of them.
-    """
-    in_patch = np.linalg.solve(warps, bends).reshape(-1, 6, 1)
-    return np.asarray((warps @ references.pulls @ in_patch)[:, :, 0])
-
-
 def _noise_bandwidth(lag_sums: Array) -> float:
     """How much more a smooth pattern suffers from the residuals than if neighbours were independent.
 
@@ -188,75 +100,6 @@ def _noise_bandwidth(lag_sums: Array) -> float:
     return float(np.prod((1 + rho) / (1 - rho)))
 
 
-@njit(cache=True, nogil=True)
-def _make_references(
-    coefficients: Coefficients, pixels: Array, offsets: Floats, root_weights: Floats
-) -> tuple[Floats, Array, Array, Array, Mask]:
-    n_patches, n_samples = len(pixels), len(offsets)
-    height, width = coefficients.shape
-    pattern = np.zeros((n_patches, _ROWS, n_samples), np.float32)
-    information = np.zeros((n_patches, _UNKNOWNS, _UNKNOWNS))
-    contrast = np.zeros(n_patches)
-    pulls = np.zeros((n_patches, 2, 6))
-    good = np.zeros(n_patches, np.bool_)
-    slopes, basis = np.zeros((_UNKNOWNS, n_samples)), np.zeros((_PHOTOMETRIC, n_samples))
-    bent = np.zeros((6, n_samples))
-    reach = np.abs(offsets).max()
-    for n in range(n_patches):
-        px, py = pixels[n, 0], pixels[n, 1]
-        if not (px - reach >= 1 and py - reach >= 1 and px + reach < width - 2 and py + reach < height - 2):
-            continue
-        for k in range(n_samples):
-            x, y, w = offsets[k, 0], offsets[k, 1], root_weights[k]
-            value, by_x, by_y = sample_with_gradient(coefficients, px + x, py + y)
-            basis[0, k], basis[1, k], basis[2, k] = w, w * x, w * y
-            basis[3, k], basis[4, k], basis[5, k] = w * value * x, w * value * y, w * value
-            slopes[0, k], slopes[1, k] = w * by_x, w * by_y
-            slopes[2, k], slopes[3, k] = w * by_x * x, w * by_x * y
-            slopes[4, k], slopes[5, k] = w * by_y * x, w * by_y * y
-        _bend_slopes(slopes, offsets, bent)
-        contrast[n] = _orthonormalise(basis)
-        if contrast[n] < 1.0:
-            continue
-        good[n] = True
-        for i in range(_UNKNOWNS):
-            for j in range(_PHOTOMETRIC):
-                slopes[i] -= np.dot(slopes[i], basis[j]) * basis[j]
-        information[n] = slopes @ slopes.T
-        ridge = 1e-9 * np.trace(information[n]) * np.eye(_UNKNOWNS)
-        pulls[n] = np.linalg.solve(information[n] + ridge, slopes @ bent.T)[:2]
-        pattern[n, :_UNKNOWNS] = slopes
-        pattern[n, _UNKNOWNS:] = basis
-    return pattern, information, contrast, pulls, good
-
-
-@register_jitable
-def _bend_slopes(slopes: Array, offsets: Floats, bent: Array) -> None:
-    """Into `bent` (6, K): the samples' derivatives by second derivatives of x and of y by xx, xy and yy."""
-    for k in range(len(offsets)):
-        x, y = offsets[k, 0], offsets[k, 1]
-        for i in range(2):
-            bent[3 * i, k] = slopes[i, k] * x * x / 2
-            bent[3 * i + 1, k] = slopes[i, k] * x * y
-            bent[3 * i + 2, k] = slopes[i, k] * y * y / 2
-
-
-@register_jitable
-def _orthonormalise(basis: Array) -> float:
-    """Gram-Schmidt in place; the norm of the last row before it was scaled, 0 if any row depends on others."""
-    norm = 0.0
-    for a in range(len(basis)):
-        before = sqrt(np.dot(basis[a], basis[a]))
-        for _ in range(2):  # twice is enough (Kahan)
-            for b in range(a):
-                basis[a] -= np.dot(basis[a], basis[b]) * basis[b]
-        norm = sqrt(np.dot(basis[a], basis[a]))
-        if norm <= 1e-6 * before or norm == 0.0:
-            return 0.0
-        basis[a] /= norm
-    return norm
-
-
 # what it calls is inlined for the reason given in `klt.py`
 @njit(cache=True, nogil=True, fastmath=SUMS_IN_ANY_ORDER)
 def _register(  # type: ignore[no-untyped-def]
@@ -265,9 +108,9 @@ def _register(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Moves `pixels` and `warps` of a range of patches; the arrays after them, which are zero, are filled."""
     n_samples = pattern.shape[2]
-    freedom = n_samples - _PHOTOMETRIC - 2
-    values, sums = np.empty(n_samples, np.float32), np.empty(_ROWS, np.float32)
-    matrix, step = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
+    freedom = n_samples - PHOTOMETRIC - 2
+    values, sums = np.empty(n_samples, np.float32), np.empty(ROWS, np.float32)
+    matrix, step = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     for n in range(first, last):
         start_x, start_y = pixels[n, 0], pixels[n, 1]
         prediction_from_patch = _inverse(warps[n])
@@ -275,11 +118,11 @@ def _register(  # type: ignore[no-untyped-def]
             power = _correlate(
                 coefficients, pattern[n], offsets, root_weights, pixels[n], warps[n], values, sums
             )
-            gain = sums[_ROWS - 1] / contrast[n]
+            gain = sums[ROWS - 1] / contrast[n]
             if power < 0 or gain < _MIN_GAIN:
                 break
             variance[n] = max(power / freedom, _MIN_VARIANCE)
-            correlation[n] = sums[_ROWS - 1] / sqrt(sums[_ROWS - 1] ** 2 + power)
+            correlation[n] = sums[ROWS - 1] / sqrt(sums[ROWS - 1] ** 2 + power)
             if found[n]:  # converged in the step before: these are the final residuals
                 spread[n] = position_spread(matrix)
                 _neighbour_products(values, pattern[n], sums, lower_right, lower_left, lag_sums[n])
@@ -322,12 +165,12 @@ def _correlate(
         y = y0 + c * offsets[k, 0] + d * offsets[k, 1]
         values[k] = root_weights[k] * (sample(coefficients, x, y) - level)
         power += values[k] * values[k]
-    for i in range(_ROWS):
+    for i in range(ROWS):
         total = np.float32(0.0)
         for k in range(len(values)):
             total += values[k] * pattern[i, k]
         sums[i] = total
-        if i >= _UNKNOWNS:
+        if i >= UNKNOWNS:
             power -= total * total
     return max(float(power), 0.0)
 
@@ -337,9 +180,9 @@ def _normal_equations(
     gain: float, information: Array, sums: Floats, weight: float, strayed: Array, matrix: Array, step: Array
 ) -> None:
     """Gauss-Newton on the patch plus the prior `strayed = 1` of the given weight."""
-    for i in range(_UNKNOWNS):
+    for i in range(UNKNOWNS):
         step[i] = gain * sums[i]
-        for j in range(_UNKNOWNS):
+        for j in range(UNKNOWNS):
             matrix[i, j] = gain * gain * information[i, j]
     for i in range(4):
         matrix[2 + i, 2 + i] += weight
@@ -392,7 +235,7 @@ def _neighbour_products(
 ) -> None:
     """Turn `values` into residuals; their squares and products with neighbours are summed up."""
     for k in range(len(values)):
-        for i in range(_UNKNOWNS, _ROWS):
+        for i in range(UNKNOWNS, ROWS):
             values[k] -= sums[i] * pattern[i, k]
     for k in range(len(values)):
         lag_sums[0] += values[k] * values[k]
