@@ -44,3 +44,15 @@ def test_errors_that_last_are_those_of_poses_and_their_deviations_honest():
     d = np.array([PORT.local(result.ref_from_members["port"]) for result in chosen])
     nees = [e @ np.linalg.solve(r.joint_covariance, e) for e, r in zip(d, chosen, strict=True)]
     assert 3.0 < np.mean(nees) < 9.0  # 6 is expected
+
+
+def test_drift_hidden_under_jitter_leaves_the_deviations_about_honest():
+    times = np.arange(176) * 0.1
+    nees = []
+    for seed in range(16):
+        result = calibrated(
+            lambda p, rng: jittered(drifting(p, 1e-4, 1e-3, rng), 1e-3, 1e-2, rng), seed, times
+        )
+        d = PORT.local(result.ref_from_members["port"])
+        nees.append(d @ np.linalg.solve(result.joint_covariance, d))
+    assert np.mean(nees) < 10.0  # 6 is expected; where its memory was taken for that of one pose, 12

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rigwake.calibration.values import UndeterminedDirection
 from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
@@ -28,6 +29,8 @@ from rigwake.handeye.problem import HandeyeProblem
 
 _OPEN_UNITS = 10.0  # how far an open direction may be off: 50 degrees, 10 m
 _BLOCKS = 30  # of time, whose scores are taken to be independent
+_LAGS = 10  # poses back, to tell how errors of poses fade
+_LONGEST = 0.98  # part of them that is left from pose to pose
 _NEGLIGIBLE = 0.02  # component of a direction that is not worth naming
 
 
@@ -63,18 +66,27 @@ def _scatter(equations: Equations) -> Array:
 
 
 def _memory(estimate: Estimate) -> float:
-    """How many poses in a row amount to one independent error: `(1 + rho) / (1 - rho)`, rho their correlation
-    with the pose before, of rotation or translation, whichever lasts longer."""
+    """How many poses in a row amount to one independent error, of rotation or translation, whichever lasts longer:
+    `1 + 2 rho_1 / (1 - phi)` for correlations `rho_k = rho_1 phi^(k-1)` with the k-th pose before, as of an error that
+    lasts beside one that does not. (Without the latter phi is rho_1.)"""
     longest = 1.0
     for m, r in enumerate(estimate.residuals):
         valid = estimate.valid[:, m]
-        pairs = valid[1:] & valid[:-1]
         for part in (slice(0, 3), slice(3, 6)):
-            before, after = r[:-1, part][pairs], r[1:, part][pairs]
-            scale = np.sqrt(np.sum(before**2) * np.sum(after**2))
-            rho = float(np.sum(before * after) / scale) if scale > 0 else 0.0
-            longest = max(longest, (1 + rho) / max(1 - rho, 1e-3))
+            rho = np.array([_correlation(r[:, part], valid, lag) for lag in range(1, _LAGS + 1)])
+            phi = rho[0]
+            if rho[0] > 2 / np.sqrt(3 * max(valid.sum(), 1)):  # stands out of what white errors show
+                phi = max(phi, float(rho[:-1] @ rho[1:] / (rho[:-1] @ rho[:-1])))
+            longest = max(longest, 1 + 2 * rho[0] / (1 - min(phi, _LONGEST)))
     return longest
+
+
+def _correlation(rows: Array, valid: NDArray[np.bool_], lag: int) -> float:
+    """Of rows (N, 3) with those `lag` before."""
+    pairs = valid[lag:] & valid[:-lag]
+    before, after = rows[:-lag][pairs], rows[lag:][pairs]
+    scale = np.sqrt(np.sum(before**2) * np.sum(after**2))
+    return float(np.sum(before * after) / scale) if scale > 0 else 0.0
 
 
 def open_directions(
