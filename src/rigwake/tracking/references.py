@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rigwake.cameras.base import Mask
 from rigwake.geometry.so3 import Array
 from rigwake.tracking.interpolation import Coefficients, sample_with_gradient
+from rigwake.tracking.small_solve import cholesky_solve
 
 Floats = NDArray[np.float32]
 
@@ -121,7 +122,7 @@ def _make_references(
     pulls = np.zeros((n_patches, 2, 6))
     good = np.zeros(n_patches, np.bool_)
     slopes, basis = np.zeros((UNKNOWNS, n_samples)), np.zeros((PHOTOMETRIC, n_samples))
-    bent = np.zeros((6, n_samples))
+    bent, factor, answer = np.zeros((6, n_samples)), np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     reach = np.abs(offsets).max()
     for n in range(n_patches):
         px, py = pixels[n, 0], pixels[n, 1]
@@ -143,9 +144,10 @@ def _make_references(
         for i in range(UNKNOWNS):
             for j in range(PHOTOMETRIC):
                 slopes[i] -= np.dot(slopes[i], basis[j]) * basis[j]
-        information[n] = slopes @ slopes.T
-        ridge = 1e-9 * np.trace(information[n]) * np.eye(UNKNOWNS)
-        pulls[n] = np.linalg.solve(information[n] + ridge, slopes @ bent.T)[:2]
+        for i in range(UNKNOWNS):
+            for j in range(UNKNOWNS):
+                information[n, i, j] = np.dot(slopes[i], slopes[j])
+        _draw(information[n], slopes, bent, factor, answer, pulls[n])
         pattern[n, :UNKNOWNS] = slopes
         pattern[n, UNKNOWNS:] = basis
     return pattern, information, contrast, pulls, good
@@ -160,6 +162,22 @@ def _bend_slopes(slopes: Array, offsets: Floats, bent: Array) -> None:
             bent[3 * i, k] = slopes[i, k] * x * x / 2
             bent[3 * i + 1, k] = slopes[i, k] * x * y
             bent[3 * i + 2, k] = slopes[i, k] * y * y / 2
+
+
+@register_jitable
+def _draw(information: Array, slopes: Array, bent: Array, factor: Array, answer: Array, pull: Array) -> None:
+    """Into `pull` (2, 6): the position fitted to what each of the bends does to the samples."""
+    ridge = 0.0
+    for i in range(UNKNOWNS):
+        ridge += 1e-9 * information[i, i]
+    for c in range(6):
+        for i in range(UNKNOWNS):
+            answer[i] = np.dot(slopes[i], bent[c])
+            for j in range(UNKNOWNS):
+                factor[i, j] = information[i, j]
+            factor[i, i] += ridge
+        if cholesky_solve(factor, answer):
+            pull[0, c], pull[1, c] = answer[0], answer[1]
 
 
 @register_jitable

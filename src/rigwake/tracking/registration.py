@@ -29,6 +29,9 @@ from rigwake.tracking.klt import SUMS_IN_ANY_ORDER
 from rigwake.tracking.references import PHOTOMETRIC, ROWS, UNKNOWNS, Floats, PatchShape, References
 from rigwake.tracking.small_solve import cholesky_solve, position_spread
 
+Entries = tuple[float, float, float, float]
+"""Of a 2x2 matrix, row by row."""
+
 _MIN_GAIN = 0.05  # a patch with less of its first contrast has gone dark
 _MIN_VARIANCE = 0.25  # grey levels^2: rounding to whole grey levels alone leaves 1/12 in each image
 _LEAST_PATCHES = 50  # that are worth a thread
@@ -113,7 +116,7 @@ def _register(  # type: ignore[no-untyped-def]
     matrix, step = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     for n in range(first, last):
         start_x, start_y = pixels[n, 0], pixels[n, 1]
-        prediction_from_patch = _inverse(warps[n])
+        prediction_from_patch = _inverse(_entries(warps[n]))
         for _ in range(iterations):
             power = _correlate(
                 coefficients, pattern[n], offsets, root_weights, pixels[n], warps[n], values, sums
@@ -127,7 +130,7 @@ def _register(  # type: ignore[no-untyped-def]
                 spread[n] = position_spread(matrix)
                 _neighbour_products(values, pattern[n], sums, lower_right, lower_left, lag_sums[n])
                 break
-            strayed = _product(prediction_from_patch, warps[n])
+            strayed = _product(prediction_from_patch, _entries(warps[n]))
             _normal_equations(gain, information[n], sums, warp_precision * variance[n], strayed, matrix, step)
             moved = _step(matrix, step, pixels[n], warps[n])
             shift = max(abs(pixels[n, 0] - start_x), abs(pixels[n, 1] - start_y))
@@ -158,7 +161,7 @@ def _correlate(
     across, down = (abs(a) + abs(b)) * reach, (abs(c) + abs(d)) * reach
     if not (x0 - across >= 1 and y0 - down >= 1 and x0 + across < width - 2 and y0 + down < height - 2):
         return -1.0
-    level = sample(coefficients, x0, y0)  # any constant would do: it keeps float32 sums exact
+    level = coefficients[int(y0), int(x0)]  # any constant would do: it keeps float32 sums exact
     power = np.float32(0.0)
     for k in range(len(offsets)):
         x = x0 + a * offsets[k, 0] + b * offsets[k, 1]
@@ -177,7 +180,7 @@ def _correlate(
 
 @register_jitable(inline="always")
 def _normal_equations(
-    gain: float, information: Array, sums: Floats, weight: float, strayed: Array, matrix: Array, step: Array
+    gain: float, information: Array, sums: Floats, weight: float, strayed: Entries, matrix: Array, step: Array
 ) -> None:
     """Gauss-Newton on the patch plus the prior `strayed = 1` of the given weight."""
     for i in range(UNKNOWNS):
@@ -186,24 +189,29 @@ def _normal_equations(
             matrix[i, j] = gain * gain * information[i, j]
     for i in range(4):
         matrix[2 + i, 2 + i] += weight
-        step[2 + i] += weight * (strayed[i // 2, i % 2] - (1.0 if i in (0, 3) else 0.0))
+        step[2 + i] += weight * (strayed[i] - (1.0 if i in (0, 3) else 0.0))
 
 
 @register_jitable(inline="always")
-def _inverse(a: Array) -> Array:
-    """Of a 2x2 matrix: for so few numbers a call of LAPACK costs more than the work."""
-    determinant = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
-    return np.array([[a[1, 1], -a[0, 1]], [-a[1, 0], a[0, 0]]]) / determinant
+def _entries(a: Array) -> Entries:
+    """Of a 2x2 matrix, row by row: as numbers, not arrays, small products compile and run sooner."""
+    return a[0, 0], a[0, 1], a[1, 0], a[1, 1]
 
 
 @register_jitable(inline="always")
-def _product(a: Array, b: Array) -> Array:
-    """Of two 2x2 matrices."""
-    out = np.empty((2, 2))
-    for i in range(2):
-        for j in range(2):
-            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j]
-    return out
+def _inverse(a: Entries) -> Entries:
+    determinant = a[0] * a[3] - a[1] * a[2]
+    return a[3] / determinant, -a[1] / determinant, -a[2] / determinant, a[0] / determinant
+
+
+@register_jitable(inline="always")
+def _product(a: Entries, b: Entries) -> Entries:
+    return (
+        a[0] * b[0] + a[1] * b[2],
+        a[0] * b[1] + a[1] * b[3],
+        a[2] * b[0] + a[3] * b[2],
+        a[2] * b[1] + a[3] * b[3],
+    )
 
 
 @register_jitable(inline="always")
@@ -212,13 +220,13 @@ def _step(matrix: Array, step: Array, pixel: Array, warp: Array) -> float:
     negative if it cannot be done. `matrix` is left as its Cholesky factor."""
     if not cholesky_solve(matrix, step):
         return -1.0
-    increment = np.array([[1.0 + step[2], step[3]], [step[4], 1.0 + step[5]]])
-    determinant = increment[0, 0] * increment[1, 1] - increment[0, 1] * increment[1, 0]
-    if not 0.2 < determinant < 5.0:
+    a, b, c, d = 1.0 + step[2], step[3], step[4], 1.0 + step[5]
+    if not 0.2 < a * d - b * c < 5.0:
         return -1.0
-    warp[:] = _product(warp, _inverse(increment))
-    dx = warp[0, 0] * step[0] + warp[0, 1] * step[1]
-    dy = warp[1, 0] * step[0] + warp[1, 1] * step[1]
+    composed = _product(_entries(warp), _inverse((a, b, c, d)))
+    for i in range(4):
+        warp[i // 2, i % 2] = composed[i]
+    dx, dy = composed[0] * step[0] + composed[1] * step[1], composed[2] * step[0] + composed[3] * step[1]
     pixel[0] -= dx
     pixel[1] -= dy
     return sqrt(dx * dx + dy * dy)

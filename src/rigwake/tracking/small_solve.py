@@ -41,11 +41,10 @@ def position_spread(factor: Array) -> float:
     total = 0.0
     column = np.empty(len(factor))
     for axis in range(2):
-        column[:] = 0.0
         for i in range(len(factor)):
             right_side = 1.0 if i == axis else 0.0
             for k in range(i):
                 right_side -= factor[i, k] * column[k]
             column[i] = right_side / factor[i, i]
-        total += np.dot(column, column)
+            total += column[i] * column[i]
     return total / 2
