@@ -63,7 +63,9 @@ def _levels(residuals: Array, arm: Array, v: float, given: float) -> tuple[float
     squares = _squares(residuals, arm)
     length2 = arm[0] * arm[0] + arm[1] * arm[1] + arm[2] * arm[2]
     # before anything is known an outlier is far by rotation, or by all of its translation
-    moved = squares[:, 1] + squares[:, 2]
+    moved = np.empty(len(squares))
+    for k in range(len(squares)):
+        moved[k] = squares[k, 1] + squares[k, 2]
     typical = np.median(moved) / _MEDIAN if len(moved) else 1.0
     share, q, swing, means = 0.5, typical + TRANSLATION_FLOOR**2, 0.0, np.zeros(5)
     for _ in range(_ROUNDS):
@@ -82,7 +84,7 @@ def _levels(residuals: Array, arm: Array, v: float, given: float) -> tuple[float
 def _squares(residuals: Array, arm: Array) -> Array:
     """(N, 5) of every residual: |r_R|^2, r_t^2 along the arm, across it, (p x r_R) . r_t, |p x r_R|^2."""
     length = math.sqrt(arm[0] * arm[0] + arm[1] * arm[1] + arm[2] * arm[2])
-    axis = arm / length if length > 0 else np.array([1.0, 0.0, 0.0])
+    ax, ay, az = (arm[0] / length, arm[1] / length, arm[2] / length) if length > 0 else (1.0, 0.0, 0.0)
     out = np.empty((len(residuals), 5))
     for k in range(len(residuals)):
         r = residuals[k]
@@ -91,7 +93,7 @@ def _squares(residuals: Array, arm: Array) -> Array:
             arm[2] * r[0] - arm[0] * r[2],
             arm[0] * r[1] - arm[1] * r[0],
         )
-        along = (axis[0] * r[3] + axis[1] * r[4] + axis[2] * r[5]) ** 2
+        along = (ax * r[3] + ay * r[4] + az * r[5]) ** 2
         out[k, 0] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
         out[k, 1] = along
         out[k, 2] = r[3] * r[3] + r[4] * r[4] + r[5] * r[5] - along
@@ -109,7 +111,9 @@ def _weighted_means(squares: Array, share: float, turned: float, along: float, a
         weight = _weight(squares[k, 0] / turned + squares[k, 1] / along + moved / across)
         for j in range(5):
             sums[j] += weight * squares[k, j]
-    return sums / max(len(squares), 1)
+    for j in range(5):
+        sums[j] /= max(len(squares), 1)
+    return sums
 
 
 @njit(cache=True)

@@ -44,12 +44,13 @@ def spline_coefficients(image: Image) -> Coefficients:
         out[y, width - 1] = gain * (out[y, width - 1] + pole * out[y, width - 2])
         for x in range(width - 2, -1, -1):
             out[y, x] = pole * (out[y, x + 1] - out[y, x])
-    first = np.zeros(width, np.float32)
-    power = np.float32(1.0)
-    for y in range(_HORIZON):
-        first += power * out[y]
-        power *= pole
-    out[0] = first
+    for x in range(width):
+        power = np.float32(1.0)
+        start = np.float32(0.0)
+        for y in range(_HORIZON):
+            start += power * out[y, x]
+            power *= pole
+        out[0, x] = start
     for y in range(1, height):
         for x in range(width):
             out[y, x] += pole * out[y - 1, x]

@@ -123,7 +123,7 @@ def _make_references(
     good = np.zeros(n_patches, np.bool_)
     slopes, basis = np.zeros((UNKNOWNS, n_samples)), np.zeros((PHOTOMETRIC, n_samples))
     bent, factor, answer = np.zeros((6, n_samples)), np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
-    reach = np.abs(offsets).max()
+    reach = offsets[-1, 1]  # the last sample is the lowest one of a disc
     for n in range(n_patches):
         px, py = pixels[n, 0], pixels[n, 1]
         if not (px - reach >= 1 and py - reach >= 1 and px + reach < width - 2 and py + reach < height - 2):
@@ -143,13 +143,14 @@ def _make_references(
         good[n] = True
         for i in range(UNKNOWNS):
             for j in range(PHOTOMETRIC):
-                slopes[i] -= np.dot(slopes[i], basis[j]) * basis[j]
+                _project_out(slopes[i], basis[j])
         for i in range(UNKNOWNS):
             for j in range(UNKNOWNS):
-                information[n, i, j] = np.dot(slopes[i], slopes[j])
+                information[n, i, j] = _dot(slopes[i], slopes[j])
         _draw(information[n], slopes, bent, factor, answer, pulls[n])
-        pattern[n, :UNKNOWNS] = slopes
-        pattern[n, UNKNOWNS:] = basis
+        for k in range(n_samples):
+            for i in range(ROWS):
+                pattern[n, i, k] = slopes[i, k] if i < UNKNOWNS else basis[i - UNKNOWNS, k]
     return pattern, information, contrast, pulls, good
 
 
@@ -172,7 +173,7 @@ def _draw(information: Array, slopes: Array, bent: Array, factor: Array, answer:
         ridge += 1e-9 * information[i, i]
     for c in range(6):
         for i in range(UNKNOWNS):
-            answer[i] = np.dot(slopes[i], bent[c])
+            answer[i] = _dot(slopes[i], bent[c])
             for j in range(UNKNOWNS):
                 factor[i, j] = information[i, j]
             factor[i, i] += ridge
@@ -185,12 +186,30 @@ def _orthonormalise(basis: Array) -> float:
     """Gram-Schmidt in place; the norm of the last row before it was scaled, 0 if any row depends on others."""
     norm = 0.0
     for a in range(len(basis)):
-        before = sqrt(np.dot(basis[a], basis[a]))
+        before = sqrt(_dot(basis[a], basis[a]))
         for _ in range(2):  # twice is enough (Kahan)
             for b in range(a):
-                basis[a] -= np.dot(basis[a], basis[b]) * basis[b]
-        norm = sqrt(np.dot(basis[a], basis[a]))
+                _project_out(basis[a], basis[b])
+        norm = sqrt(_dot(basis[a], basis[a]))
         if norm <= 1e-6 * before or norm == 0.0:
             return 0.0
-        basis[a] /= norm
+        for k in range(basis.shape[1]):
+            basis[a, k] /= norm
     return norm
+
+
+# as loops: operations on whole arrays take numba ten times as long to compile
+@register_jitable
+def _dot(a: Array, b: Array) -> float:
+    total = 0.0
+    for k in range(len(a)):
+        total += a[k] * b[k]
+    return total
+
+
+@register_jitable
+def _project_out(a: Array, unit: Array) -> None:
+    """Take the part along a unit vector off, in place."""
+    along = _dot(a, unit)
+    for k in range(len(a)):
+        a[k] -= along * unit[k]
