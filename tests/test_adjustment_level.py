@@ -29,6 +29,7 @@ def calm() -> SimulatedTracks:
     return sail(features=50, sea={"hs_m": 0.0})
 
 
+@pytest.mark.slow
 def test_heights_that_nothing_tells_are_held_near_one(calm: SimulatedTracks) -> None:
     adjusted = adjust(assembled(calm), OPTIONS)
     level = at_one_height(adjusted.solution.problem)
@@ -70,6 +71,7 @@ def test_rounding_does_not_open_what_cancels(calm: SimulatedTracks) -> None:
     assert seen.cameras[names[1]].is_determined
 
 
+@pytest.mark.slow
 def test_a_height_that_all_cameras_share_is_not_open_between_them(calm: SimulatedTracks) -> None:
     whole = assembled(calm)
     truth = rig_in_frame(calm.recording.true_rig, "imu")

@@ -96,6 +96,7 @@ def test_learnt_noise_is_as_good_as_told_whichever_side_is_better(sides, arm_m):
     assert 3.0 < np.mean(nees) < 9.0  # 6 is expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sides", [(1e-5, 1e-3), (1e-3, 1e-5)])
 def test_members_together_tell_whose_errors_they_share(sides):
     mountings = [camera(yaw, 15, [8.0, y, 1.4]) for yaw, y in ((90, 1.2), (-90, -1.2), (0, 0.0))]

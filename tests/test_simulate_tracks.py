@@ -115,6 +115,7 @@ def test_a_small_raft_rides_the_surface_that_is_seen() -> None:
             assert (roll, -pitch) == pytest.approx((slope_y, slope_x), abs=4e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("hs_m", "tp_s", "low", "high"), [(0.25, 3.2, 1.1, 1.4), (0.5, 4.0, 1.8, 2.4)])
 def test_the_boat_rolls_and_pitches_as_much_as_such_a_sea_makes_it(
     thesis: Scenario, hs_m: float, tp_s: float, low: float, high: float
@@ -178,6 +179,7 @@ def test_inertial_samples_are_derivatives_of_the_motion(lively: Simulation) -> N
     np.testing.assert_allclose(accel, np.einsum("nji,nj->ni", now.rotation, pushed), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_noise_levels_are_those_asked_for(thesis: Scenario) -> None:
     scenario = changed(
         thesis, duration_s=400, imu__rate_hz=100, imu__gyro_noise_density=2e-3, imu__accel_noise_density=3e-2,
