@@ -66,9 +66,8 @@ def one_blas_thread() -> AbstractContextManager[Any]:
 
 @lru_cache(maxsize=1)
 def _libraries() -> ThreadpoolController:
-    return (
-        ThreadpoolController()
-    )  # looks through all that is loaded, which takes as long as a small adjustment
+    # looks through all that is loaded, which takes as long as a small adjustment
+    return ThreadpoolController()
 
 
 @lru_cache(maxsize=1)

@@ -44,9 +44,8 @@ _MAX_ROUNDS = 4
 _MIN_VIEWS = 3
 _HELD_STD = 1e-9
 _SOLVER = SolverOptions(loss="cauchy", loss_scale=2.0, tolerance=1e-5, max_iterations=20)
-_LENS_SOLVER = replace(
-    _SOLVER, tolerance=1e-7, max_iterations=60
-)  # centre and decentring creep along a valley
+# centre and decentring creep along a valley
+_LENS_SOLVER = replace(_SOLVER, tolerance=1e-7, max_iterations=60)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Pyramidal Lucas-Kanade from one frame to the next, checked forwards and backwards.
 
 What OpenCV's `calcOpticalFlowPyrLK` does, step for step, on pyramids that are made once per image, in compiled
-loops that take less than half of its processor time. Source: Bouguet, *Pyramidal implementation of the affine Lucas
+loops that take 0.6 of its processor time. Source: Bouguet, *Pyramidal implementation of the affine Lucas
 Kanade feature tracker* (2000).
 """
 
