@@ -1,11 +1,11 @@
-"""The rig of recordings with known truth, by method: seed pipeline, hand-eye only, without and with hand-over.
+"""The rig of recordings with known truth, by method: thesis pipeline, hand-eye only, without and with cross-camera association.
 
     python benchmarks/calibrate.py [--peers] [RECORDING TRUTH]...
 
 Without arguments: `harbour_a` in RIGWAKE_DATA, or in ../shared/data beside the project. --peers: pycolmap too, see
 `colmap_rig.py` (some ten minutes). Errors are those of the worst pair of cameras, which needs no common reference.
 Seconds and peak memory are of the whole process and its children, from images to calibration; `hand-eye only` stops
-before the adjustment, so it has no figures of its own.
+before the bundle adjustment, so it has no figures of its own.
 """
 
 import os
@@ -18,15 +18,15 @@ from pathlib import Path
 from rigwake.calibration import Calibration, load_calibration
 from rigwake.config import load_config
 from rigwake.errors import RigwakeError
-from rigwake.evaluate.calibrations import evaluate_calibration
-from rigwake.handeye.calibrate import calibrate_handeye
-from rigwake.handeye.values import HandeyeOptions
+from rigwake.evaluation.rig_errors import evaluate_calibration
+from rigwake.handeye.handeye_result import HandeyeOptions
+from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.odometry.metric import metric_start
-from rigwake.odometry.seed import estimate_seed
-from rigwake.pipeline.calibrate import calibrate
+from rigwake.odometry.thesis_odometry import estimate_thesis
+from rigwake.pipeline.calibration_run import calibrate
 from rigwake.pipeline.camera_stage import tracks_file
 from rigwake.readers.open import open_recording
-from rigwake.readers.truth import read_true_rig, rig_in_frame
+from rigwake.readers.truth_files import read_true_rig, rig_in_frame
 from rigwake.rig import Rig
 from rigwake.tracks import load_tracks
 
@@ -56,17 +56,17 @@ def row(name: str, method: str, found: Calibration | str, truth: Rig, used: str)
 
 
 def seed_pipeline(recording: Path, out: Path) -> Calibration | str:
-    """Frame-to-frame odometry of every camera's tracks, put into metres by GNSS, then the seed's hand-eye."""
+    """Frame-to-frame odometry of every camera's tracks, put into metres by GNSS, then the thesis baseline's hand-eye."""
     opened = open_recording(recording)
     gnss = next(iter(opened.gnss.values()), None)
     try:
         paths = [
-            metric_start(estimate_seed(load_tracks(tracks_file(out, name)), stream.model), None, gnss)
+            metric_start(estimate_thesis(load_tracks(tracks_file(out, name)), stream.model), None, gnss)
             for name, stream in opened.cameras.items()
             if stream.model is not None
         ]
         metric = [path.world_from_cam for path in paths]
-        return calibrate_handeye(metric[0], metric[1:], HandeyeOptions(method="seed")).calibration()
+        return calibrate_handeye(metric[0], metric[1:], HandeyeOptions(method="thesis")).calibration()
     except RigwakeError as error:
         return str(error.cause)
 
@@ -85,7 +85,10 @@ def compare(recording: Path, truth_file: Path, peers: bool) -> None:
     name, truth = recording.stem, read_true_rig(truth_file)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
-        for method, settings in (("ours", ()), ("ours, no hand-over", ("adjustment.cross_camera=false",))):
+        for method, settings in (
+            ("ours", ()),
+            ("ours, no cross-camera association", ("adjustment.cross_camera=false",)),
+        ):
             resumed = bool(settings)
             wall, cpu = time.perf_counter(), cpu_s()
             try:
@@ -100,7 +103,7 @@ def compare(recording: Path, truth_file: Path, peers: bool) -> None:
         row(name, "ours, hand-eye only", load_calibration(out / "initial_rig.yaml"), truth, "")
         cpu = cpu_s()
         found = seed_pipeline(recording, out)
-        row(name, "seed pipeline", found, truth, f"{cpu_s() - cpu:.0f} CPU s after tracking")
+        row(name, "thesis pipeline", found, truth, f"{cpu_s() - cpu:.0f} CPU s after tracking")
     if peers:
         wall, cpu = time.perf_counter(), cpu_s()
         found = pycolmap_rig(recording)

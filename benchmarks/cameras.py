@@ -11,8 +11,8 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from rigwake.cameras.catalogue import camera_from_params
-from rigwake.cameras.lens import Lens
+from rigwake.cameras.models.lens import Lens
+from rigwake.cameras.registry import camera_from_params
 
 COUNT = 1_000_000
 MODELS: dict[str, list[float]] = {

@@ -17,11 +17,11 @@ import cv2  # before pycolmap: the other order breaks reading PNG files
 import numpy as np
 import pycolmap
 
-from rigwake.cameras.base import CameraModel
+from rigwake.cameras.protocol import CameraModel
 from rigwake.geometry.se3 import SE3
 from rigwake.recording import CameraStream
-from rigwake.tracking.hull import find_hull
 from rigwake.tracking.masks import lens_mask, pixel_grid
+from rigwake.tracking.self_mask import find_self_mask
 from rigwake.trajectory import Trajectory
 
 pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
@@ -52,7 +52,7 @@ def colmap_camera(model: CameraModel) -> tuple[str, str]:
 def write_mask(stream: CameraStream, path: Path) -> None:
     """Black beyond 88 degrees, beyond the lens and on the own hull."""
     usable = lens_mask(stream).usable
-    usable &= ~find_hull(stream, usable)
+    usable &= ~find_self_mask(stream, usable)
     bearings, _ = stream.model.unproject(pixel_grid(stream.width_px, stream.height_px))
     usable &= (bearings[:, 2] > np.cos(np.deg2rad(WIDEST_DEG))).reshape(usable.shape)
     cv2.imwrite(str(path), usable.astype(np.uint8) * 255)

@@ -1,10 +1,10 @@
-"""The peer of rig calibration: pycolmap on the images of all cameras, then its rig adjustment.
+"""The peer of rig calibration: pycolmap on the images of all cameras, then its rig bundle adjustment.
 
     python benchmarks/colmap_rig.py RECORDING TRUTH [--rate HZ]
 
 SIFT on the CPU, all pairs of images matched (cameras without common view are tied by what they see at different times),
 incremental mapping with the given lenses, the rig taken from the model and adjusted with it, and metres from GNSS by
-aligning the leading camera's path. Its fisheye model knows nothing beyond 90 degrees, so images are masked to 88,
+aligning the reference camera's path. Its fisheye model knows nothing beyond 90 degrees, so images are masked to 88,
 and the own hull is masked with what our camera stage has found. Clocks and lever arm are not in its model.
 """
 
@@ -22,11 +22,11 @@ import pycolmap
 from colmap_odometry import colmap_camera, write_mask
 from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.errors import EstimationError
-from rigwake.evaluate.calibrations import evaluate_calibration
+from rigwake.evaluation.rig_errors import evaluate_calibration
 from rigwake.geometry.align import align_points
 from rigwake.geometry.se3 import SE3
 from rigwake.readers.open import open_recording
-from rigwake.readers.truth import read_true_rig, rig_in_frame
+from rigwake.readers.truth_files import read_true_rig, rig_in_frame
 from rigwake.recording import CameraStream, GnssStream, Recording
 
 NEAR_NS = 60_000_000

@@ -1,4 +1,4 @@
-"""Accuracy and time of hand-eye methods: the classical closed forms, the seed method and `ml`.
+"""Accuracy and time of hand-eye methods: the classical closed forms, the thesis baseline and `ml`.
 
     python benchmarks/handeye_methods.py [--draws 30] [--only accuracy|time]
 
@@ -23,10 +23,10 @@ import numpy as np
 
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.calibrate import calibrate_handeye
 from rigwake.handeye.closed_forms import CLOSED_FORMS
-from rigwake.handeye.seed import seed_handeye
-from rigwake.handeye.values import HandeyeOptions
+from rigwake.handeye.handeye_result import HandeyeOptions
+from rigwake.handeye.joint_calibration import calibrate_handeye
+from rigwake.handeye.thesis_handeye import thesis_handeye
 from rigwake.trajectory import Trajectory
 
 STUDY = runpy.run_path(str(Path(__file__).with_name("noise_study.py")))
@@ -80,7 +80,7 @@ def solvers(kind: str) -> dict[str, Solver]:
     if hasattr(cv2, "calibrateHandEye"):
         for name in ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS"):
             found[f"cv2 {name}"] = opencv(getattr(cv2, f"CALIB_HAND_EYE_{name}"))
-    found["seed"] = seed_handeye
+    found["seed"] = thesis_handeye
     found["ml, noise estimated"] = ml()
     found["ml, kind of noise told"] = ml(noise="poses" if kind == "additive" else "increments")
     found["ml, noise and clock estimated"] = ml(time_offset=True)
@@ -127,8 +127,8 @@ def noisy_pair(kind: str, seed: int) -> list[Trajectory]:
         for each in {"increments": ["cumulative"], "jitter": ["additive"], "exact": []}.get(
             kind, ["cumulative", "additive"]
         ):
-            share = 0.3 if kind == "both" and each == "cumulative" else 1.0
-            poses = STUDY["noisy"](poses, each, share * 1e-4, share * 1e-3, rng)
+            fraction = 0.3 if kind == "both" and each == "cumulative" else 1.0
+            poses = STUDY["noisy"](poses, each, fraction * 1e-4, fraction * 1e-3, rng)
         pair.append(STUDY["trajectory"](name.lower(), poses))
     return pair
 
@@ -138,8 +138,8 @@ def short_trajectories(draws: int) -> None:
     print(f"| 176 poses, {draws} draws | clock | CPU ms: median (best) | wall ms: median (best) | / 10 ms |")
     print("|---|---|---|---|---|")
     for kind in ("exact", "increments", "jitter", "both"):
-        for clock in (False, True):
-            options, cpu, wall = HandeyeOptions(time_offset=clock), [], []
+        for time_offset in (False, True):
+            options, cpu, wall = HandeyeOptions(time_offset=time_offset), [], []
             for draw in range(draws):
                 front, port = noisy_pair(kind, draw)
                 if draw == 0:
@@ -149,7 +149,7 @@ def short_trajectories(draws: int) -> None:
                 cpu.append(1e3 * (process_time() - start[0]))
                 wall.append(1e3 * (perf_counter() - start[1]))
             print(
-                f"| {kind} | {'estimated' if clock else 'known'} | {np.median(cpu):.1f} ({min(cpu):.1f}) | "
+                f"| {kind} | {'estimated' if time_offset else 'known'} | {np.median(cpu):.1f} ({min(cpu):.1f}) | "
                 f"{np.median(wall):.1f} ({min(wall):.1f}) | {np.median(cpu) / 10:.2f} |"
             )
 
@@ -166,13 +166,13 @@ def long_trajectory() -> None:
         Trajectory("rig", stamps, body.retract(noise[0])),
         Trajectory("port", stamps, (body * STUDY["PORT"]).retract(noise[1])),
     ]
-    for clocks in (False, True):
+    for time_offsets in (False, True):
         took = []
         for _ in range(5):
             start = process_time()
-            calibrate_handeye(pair[0], pair[1:], HandeyeOptions(time_offset=clocks))
+            calibrate_handeye(pair[0], pair[1:], HandeyeOptions(time_offset=time_offsets))
             took.append(process_time() - start)
-        kind = "estimated" if clocks else "known"
+        kind = "estimated" if time_offsets else "known"
         print(f"100 000 poses, clocks {kind}: {np.median(took):.2f} s of CPU (best {min(took):.2f})")
 
 

@@ -22,10 +22,10 @@ import numpy as np
 
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
-from rigwake.handeye.calibrate import calibrate_handeye
 from rigwake.handeye.closed_forms import park_martin
-from rigwake.handeye.resample import Curve
-from rigwake.handeye.values import HandeyeOptions
+from rigwake.handeye.handeye_result import HandeyeOptions
+from rigwake.handeye.joint_calibration import calibrate_handeye
+from rigwake.handeye.resample import TrajectoryCurve
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.trajectory import Trajectory
 
@@ -67,12 +67,12 @@ def degrees_and_mm(transform: SE3) -> tuple[float, float]:
 def pairwise_loop(trajectories: dict[str, Trajectory]) -> tuple[float, float, float]:
     """Degrees, millimetres and milliseconds by which three independent pairwise results do not close."""
     names = list(trajectories)
-    loop, clock = SE3.identity(), 0.0
+    loop, time_offset = SE3.identity(), 0.0
     for a, b in zip(names, names[1:] + names[:1], strict=True):
         result = calibrate_handeye(trajectories[a], [trajectories[b]])
         loop = loop * result.ref_from_members[b]
-        clock += result.members[b].time_offset_s or 0.0
-    return *degrees_and_mm(loop), 1e3 * clock
+        time_offset += result.members[b].time_offset_s or 0.0
+    return *degrees_and_mm(loop), 1e3 * time_offset
 
 
 def naive_loops(trajectories: dict[str, Trajectory], stride: int) -> dict[str, tuple[float, float]]:
@@ -84,7 +84,7 @@ def naive_loops(trajectories: dict[str, Trajectory], stride: int) -> dict[str, t
     names = list(trajectories)
     for a, b in zip(names, names[1:] + names[:1], strict=True):
         offset = calibrate_handeye(trajectories[a], [trajectories[b]]).members[b].time_offset_s or 0.0
-        first, second = Curve.of(trajectories[a]), Curve.of(trajectories[b])
+        first, second = TrajectoryCurve.of(trajectories[a]), TrajectoryCurve.of(trajectories[b])
         there = first.times_s + (first.start_ns - second.start_ns) * 1e-9 - offset
         inside = (there >= 0) & (there <= second.times_s[-1])
         poses = [first.world_from_body[inside], second.at(there[inside]).world_from_body]
@@ -116,7 +116,7 @@ class HalvesAgree:
 
 def compare_halves(reference: Trajectory, members: list[Trajectory]) -> HalvesAgree:
     first, second = (calibrate_handeye(half, members) for half in halves(reference))
-    sigmas, sizes, clocks = {}, {}, {}
+    sigmas, sizes, time_offsets = {}, {}, {}
     for name, X in first.ref_from_members.items():
         difference = X.local(second.ref_from_members[name])
         covariance = first.members[name].covariance + second.members[name].covariance
@@ -124,8 +124,8 @@ def compare_halves(reference: Trajectory, members: list[Trajectory]) -> HalvesAg
         sigmas[name] = turned / np.sqrt(np.diag(covariance_in_axes_of_a(X, covariance)))
         sizes[name] = degrees_and_mm(SE3.exp(difference))
         offsets = [r.members[name].time_offset_s or 0.0 for r in (first, second)]
-        clocks[name] = 1e3 * (offsets[1] - offsets[0])
-    return HalvesAgree(sigmas, sizes, clocks)
+        time_offsets[name] = 1e3 * (offsets[1] - offsets[0])
+    return HalvesAgree(sigmas, sizes, time_offsets)
 
 
 def board_trajectory(recordings: Path, camera: str) -> Trajectory:
@@ -204,11 +204,11 @@ def main() -> None:
         print(f"no real recordings at {recordings}: name their folder, or set RIGWAKE_DATA")
         return
     devices = tango_trajectories(recordings)
-    turn, shift, clock = pairwise_loop(devices)
+    turn, shift, time_offset = pairwise_loop(devices)
     print("| what | measured | physical limit |\n|---|---|---|")
     print(
         f"| tango_triplet: three pairwise results around the loop | {turn:.4f} deg, {shift:.2f} mm, "
-        f"{clock:+.2f} ms | 0 |"
+        f"{time_offset:+.2f} ms | 0 |"
     )
     for whose, (turn, shift) in naive_loops(devices, 25).items():
         print(

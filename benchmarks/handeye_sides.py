@@ -13,8 +13,8 @@ import numpy as np
 
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.calibrate import calibrate_handeye
-from rigwake.handeye.values import HandeyeOptions, NoiseLevel, NoiseModel
+from rigwake.handeye.handeye_result import HandeyeOptions, NoiseLevel, NoiseModel
+from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.trajectory import Trajectory
 
 POSES, PERIOD_S, TRANSLATION_STD = 176, 0.2, 1e-3
@@ -57,14 +57,14 @@ def compare(kind: str, sides: tuple[float, float], arm_m: float, draws: int) -> 
     turn = so3.exp([0, 0, np.deg2rad(90)]) @ so3.exp([0, np.deg2rad(15), 0])
     X, rng = SE3(turn @ OPTICAL, np.array([arm_m, 1.2, 1.4])), np.random.default_rng(3)
     levels = {n: NoiseLevel(s, TRANSLATION_STD) for n, s in zip(("reference", "camera"), sides, strict=True)}
-    told = HandeyeOptions(noise=KINDS[kind], levels=levels)
+    known_fraction = HandeyeOptions(noise=KINDS[kind], levels=levels)
     errors: dict[bool, list[np.ndarray]] = {True: [], False: []}
     nees = []
     for _ in range(draws):
         reference = noisy("reference", sailed(), kind, sides[0], rng)
         member = noisy("camera", sailed() * X, kind, sides[1], rng)
         for learnt in (True, False):
-            result = calibrate_handeye(reference, [member], HandeyeOptions() if learnt else told)
+            result = calibrate_handeye(reference, [member], HandeyeOptions() if learnt else known_fraction)
             error = X.local(result.ref_from_members["camera"])
             errors[learnt].append(error)
             if learnt:

@@ -19,12 +19,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 from handeye_real import EUROC_CAM0_FROM_CAM1, EUROC_INTRINSICS, board_trajectory, degrees_and_mm
-from rigwake.adjustment.assemble import assemble_problem
-from rigwake.adjustment.imu_noise import imu_noise_factors
-from rigwake.adjustment.rounds import adjust
-from rigwake.adjustment.start import first_rig
-from rigwake.adjustment.values import AdjustedRig, AdjustmentOptions, RigMeasurements
-from rigwake.cameras.catalogue import camera_from_params
+from rigwake.ba.rig.assemble_problem import assemble_problem
+from rigwake.ba.rig.imu_noise import imu_noise_factors
+from rigwake.ba.rig.initialisation import initial_rig
+from rigwake.ba.rig.outlier_rounds import adjust
+from rigwake.ba.rig.rig_values import AdjustedRig, AdjustmentOptions, RigMeasurements
+from rigwake.cameras.registry import camera_from_params
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.recording import ImuStream
@@ -90,7 +90,7 @@ def calibrate_boards(recordings: Path) -> AdjustedRig:
         camera: replace(board_trajectory(recordings, camera), covariances=None) for camera in EUROC_INTRINSICS
     }
     imu = read_imu(recordings)
-    first = first_rig(trajectories, {camera: lens(camera) for camera in tracks}, imu, None)
+    first = initial_rig(trajectories, {camera: lens(camera) for camera in tracks}, imu, None)
     return adjust(assemble_problem(RigMeasurements(tracks, imu), first.start, OPTIONS), OPTIONS)
 
 
@@ -99,7 +99,7 @@ def main() -> None:
     recordings = Path(sys.argv[1] if len(sys.argv) > 1 else os.environ.get("RIGWAKE_DATA", beside))
     adjusted = calibrate_boards(recordings)
     problem = adjusted.solution.problem
-    print("| | from published: deg | mm | clock ms |\n|---|---|---|---|")
+    print("| | from published: deg | mm | offset ms |\n|---|---|---|---|")
     for camera in problem.cameras:
         turn, shift = degrees_and_mm(PUBLISHED[camera.name].inverse() * camera.rig_from_cam)
         print(f"| imu, {camera.name} | {turn:.3f} | {shift:.2f} | {1e3 * camera.time_offset_s:+.3f} |")
@@ -108,7 +108,7 @@ def main() -> None:
     print(f"| cam0, cam1 | {turn:.3f} | {shift:.2f} | |")
     assert problem.imu is not None
     noise = adjusted.noise_factors | imu_noise_factors(read_imu(recordings), problem.imu)
-    print(f"\n{len(problem.observations)} corners; noise against its promise:", end=" ")
+    print(f"\n{len(problem.observations)} corners; noise against its assumed value:", end=" ")
     print(", ".join(f"{name} {factor:.1f}" for name, factor in noise.items()))
 
 

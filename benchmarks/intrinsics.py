@@ -13,13 +13,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.files import read_camera
+from rigwake.cameras.formats.camera_files import read_camera
+from rigwake.cameras.protocol import CameraModel
 from rigwake.geometry.se3 import stack
-from rigwake.intrinsics.adjust import Estimate, adjust, residuals
-from rigwake.intrinsics.calibrate import calibrate
-from rigwake.intrinsics.initialise import stacked, view_pose
-from rigwake.intrinsics.observations import BoardObservations, read_corner_file
+from rigwake.intrinsics.board_adjustment import BoardEstimate, adjust, residuals
+from rigwake.intrinsics.board_calibration import calibrate
+from rigwake.intrinsics.board_observations import BoardObservations, read_corner_file
+from rigwake.intrinsics.initial_guess import stacked, view_pose
 from rigwake.intrinsics.select import cross_validate
 
 SIZE = 752, 480
@@ -28,7 +28,7 @@ SIZE = 752, 480
 def rms_of(camera: CameraModel, observations: BoardObservations) -> float:
     """RMS distance of all corners with this camera, the board's poses fitted by plain least squares."""
     poses = [view_pose(camera, view) for view in observations.views]
-    start = Estimate(camera, stack([pose for pose in poses if pose is not None]))
+    start = BoardEstimate(camera, stack([pose for pose in poses if pose is not None]))
     corners = stacked(observations)
     estimate, _ = adjust(start, corners, np.zeros(len(camera.params), dtype=np.bool_))
     return float(np.sqrt(np.mean(np.sum(residuals(estimate, corners)[0] ** 2, axis=1))))
@@ -43,8 +43,8 @@ def opencv(observations: BoardObservations, flags: int) -> tuple[float, np.ndarr
 
 
 def row(label: str, focal: np.ndarray, stds: np.ndarray | None, rms: float, held: str, seconds: str) -> str:
-    doubt = [""] * 4 if stds is None else [f" ± {std:.2f}" for std in stds]
-    numbers = " | ".join(f"{value:.2f}{std}" for value, std in zip(focal, doubt, strict=True))
+    required_ratio = [""] * 4 if stds is None else [f" ± {std:.2f}" for std in stds]
+    numbers = " | ".join(f"{value:.2f}{std}" for value, std in zip(focal, required_ratio, strict=True))
     return f"| {label} | {numbers} | {rms:.3f} | {held} | {seconds} |"
 
 

@@ -18,13 +18,13 @@ import numpy as np
 
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.calibrate import calibrate_handeye
+from rigwake.handeye.handeye_problem import pose_problem, step_covariances
+from rigwake.handeye.handeye_result import HandeyeOptions, NoiseLevel
 from rigwake.handeye.information import form_equations
+from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.handeye.motions import Mounting, residuals
 from rigwake.handeye.noise import Jitter, known_noise
-from rigwake.handeye.problem import pose_problem, step_covariances
-from rigwake.handeye.seed import seed_handeye
-from rigwake.handeye.values import HandeyeOptions, NoiseLevel
+from rigwake.handeye.thesis_handeye import thesis_handeye
 from rigwake.trajectory import Trajectory
 
 POSES, RADIUS_M, STEP_NS = 176, 20.0, 100_000_000
@@ -147,7 +147,7 @@ def study(kind: str, rotation_std: float, translation_std: float, draws: int) ->
         rng = np.random.default_rng(draw)
         front = noisy(boat() * FRONT, kind, rotation_std, translation_std, rng)
         port = noisy(boat() * PORT, kind, rotation_std, translation_std, rng)
-        seeds.append(in_boat_axes(TRUTH.local(seed_handeye(front, port))))
+        seeds.append(in_boat_axes(TRUTH.local(thesis_handeye(front, port))))
         result = calibrate_handeye(trajectory("front", front), [trajectory("port", port)], options)
         d = TRUTH.local(result.ref_from_members["port"])
         ours.append(in_boat_axes(d))

@@ -15,37 +15,35 @@ from typing import get_args
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rigwake._types import Array, Indices
 from rigwake.errors import RigwakeError
-from rigwake.evaluate.trajectories import absolute_error, associate, kitti_error
+from rigwake.evaluation.trajectory_errors import absolute_error, associate, kitti_error
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
-from rigwake.odometry.camera import CameraOdometryOptions, run_camera
+from rigwake.odometry.camera_odometry import CameraOdometryOptions, run_camera
 from rigwake.odometry.metric import metric_start
 from rigwake.odometry.monocular import estimate_monocular
-from rigwake.odometry.options import OdometryOptions
-from rigwake.odometry.seed import SeedOptions, estimate_seed
+from rigwake.odometry.odometry_options import OdometryOptions
 from rigwake.odometry.self_calibration import estimate_refining_lens
 from rigwake.odometry.smoother import smooth
 from rigwake.odometry.stereo import estimate_stereo
+from rigwake.odometry.thesis_odometry import ThesisOptions, estimate_thesis
 from rigwake.readers.open import open_recording
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.recording import CameraStream
 from rigwake.tracking.front_ends import track_camera
-from rigwake.tracking.options import FrontEndName, TrackingOptions
+from rigwake.tracking.tracking_options import FrontEndName, TrackingOptions
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
 DATA = Path(os.environ.get("RIGWAKE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 SEEDS = 3
-FOCAL_SHARE = 0.995
+FOCAL_FRACTION = 0.995
 KITTI_PEER_STEP, HARBOUR_PEER_STEP = (
     2,
     4,
 )  # the peer, of much slower mappers, gets every second or fourth frame
-Indices = NDArray[np.int64]
 HEADER = (
     "| recording | method | frames | alignment | ATE m | ATE % of path | rotation deg | CPU s | fps |\n"
     + "|---" * 9
@@ -57,9 +55,9 @@ def row(
     name: str, method: str, truth: Trajectory, found: Trajectory, frames: int, cpu_s: float, kind: str
 ) -> None:
     error = absolute_error(truth, found, alignment=kind)
-    share = 100 * error.rmse_m / truth.path_length
+    fraction = 100 * error.rmse_m / truth.path_length
     print(
-        f"| {name} | {method} | {len(found)}/{frames} | {kind} | {error.rmse_m:.3f} | {share:.2f} | "
+        f"| {name} | {method} | {len(found)}/{frames} | {kind} | {error.rmse_m:.3f} | {fraction:.2f} | "
         f"{error.rotation_rmse_deg:.3f} | {cpu_s:.1f} | {frames / cpu_s:.0f} |",
         flush=True,
     )
@@ -144,7 +142,7 @@ def monocular(name: str, stream: CameraStream, truth: Trajectory, peers: bool) -
         ("frame to frame (seed)", frame_to_frame),
         ("rigwake, lens as given", lens_as_given),
         ("rigwake", lens_refined),
-        (f"rigwake, focal length {100 * (FOCAL_SHARE - 1):+.1f} %", another_focal_length),
+        (f"rigwake, focal length {100 * (FOCAL_FRACTION - 1):+.1f} %", another_focal_length),
     ):
         runs = []
         for seed in range(SEEDS):
@@ -165,7 +163,7 @@ def monocular(name: str, stream: CameraStream, truth: Trajectory, peers: bool) -
 
 
 def frame_to_frame(tracks: Tracks, stream: CameraStream, seed: int) -> Trajectory:
-    return estimate_seed(tracks, stream.model, SeedOptions(seed=seed))
+    return estimate_thesis(tracks, stream.model, ThesisOptions(seed=seed))
 
 
 def lens_as_given(tracks: Tracks, stream: CameraStream, seed: int) -> Trajectory:
@@ -185,8 +183,8 @@ def lens_refined(tracks: Tracks, stream: CameraStream, seed: int) -> Trajectory:
 def another_focal_length(tracks: Tracks, stream: CameraStream, seed: int) -> Trajectory:
     """What the rotations owe to the focal length given: the same with another one."""
     lens = stream.model
-    share = np.array([FOCAL_SHARE if name in ("fx", "fy") else 1.0 for name in lens.param_names])
-    other = lens.with_params(share * np.array(lens.params))
+    fraction = np.array([FOCAL_FRACTION if name in ("fx", "fy") else 1.0 for name in lens.param_names])
+    other = lens.with_params(fraction * np.array(lens.params))
     bearings, _ = other.unproject(tracks.pixels)
     return lens_refined(replace(tracks, bearings_cam=bearings), replace(stream, model=other), seed)
 
@@ -269,7 +267,7 @@ def harbour(peers: bool) -> None:
         row(
             f"harbour_a {name}", "rigwake vision + IMU", truth, inertial.trajectory, len(stream), cpu_s, "se3"
         )
-        seed = estimate_seed(result.tracks, stream.model)
+        seed = estimate_thesis(result.tracks, stream.model)
         row(f"harbour_a {name}", "frame to frame (seed)", truth, seed, len(stream), cpu_s, "sim3")
         labels(name, result)
         if peers:
@@ -299,7 +297,7 @@ def speed(peers: bool) -> None:
 
 
 def labels(name: str, result) -> None:
-    """Share of inliers on water and hull in the first frame, where labels are known."""
+    """Fraction of inliers on water and hull in the first frame, where labels are known."""
     image = cv2.imread(str(DATA / "harbour_a" / f"truth_labels_{name}.png"), cv2.IMREAD_GRAYSCALE)
     first = result.visual.inliers & (result.tracks.frame_indices < 3)
     at = np.clip(

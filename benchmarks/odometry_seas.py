@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 import yaml
 
-from rigwake.evaluate.trajectories import absolute_error
-from rigwake.odometry.camera import run_camera
+from rigwake.evaluation.trajectory_errors import absolute_error
+from rigwake.odometry.camera_odometry import run_camera
 from rigwake.readers.open import open_recording
 from rigwake.readers.trajectories import read_trajectory
-from rigwake.simulate.scenario import load_scenario
+from rigwake.simulation.scenario import load_scenario
 
 SEAS = {
     "calmer": {"hs_m": 0.06, "tp_s": 2.6},

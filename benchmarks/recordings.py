@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
 from rigwake.readers.open import open_recording
-from rigwake.readers.ros_messages import typestore
+from rigwake.readers.ros_decoding import typestore
 from rigwake.recording import CameraStream, Frame, GnssStream, ImuStream, Recording
 from rigwake.writers.write import write_recording
 

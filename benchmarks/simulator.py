@@ -15,12 +15,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from rigwake.cameras.catalogue import camera_from_params
-from rigwake.simulate.record import SeaCache, Shot, build_world
-from rigwake.simulate.scenario import load_scenario
-from rigwake.simulate.selfcheck import corner_errors, motion_agreement
-from rigwake.simulate.setup import Simulation, prepare
-from rigwake.simulate.tracks_only import simulate_tracks
+from rigwake.cameras.registry import camera_from_params
+from rigwake.simulation.record import SeaCache, Shot, build_world
+from rigwake.simulation.scenario import load_scenario
+from rigwake.simulation.selfcheck import corner_errors, motion_agreement
+from rigwake.simulation.setup import Simulation, prepare
+from rigwake.simulation.tracks_only import simulate_tracks
 
 WORKERS = 2
 IMAGES = 24
@@ -100,8 +100,8 @@ def motion(simulation: Simulation, shots: list[Shot]) -> None:
             agreement = motion_agreement(shot, exact, first, first + 1)
             print(
                 f"| {shot.camera.name}, frame {first} | {np.median(agreement.flow_error_px):.3f} px "
-                f"| {100 * agreement.land_share:.1f} % of {agreement.land_tracks} "
-                f"| {100 * agreement.water_share:.1f} % of {agreement.water_tracks} |"
+                f"| {100 * agreement.land_fraction:.1f} % of {agreement.land_tracks} "
+                f"| {100 * agreement.water_fraction:.1f} % of {agreement.water_tracks} |"
             )
 
 

@@ -20,13 +20,20 @@ from dataclasses import replace
 import cv2  # noqa: F401  before pycolmap, which otherwise spoils its image reading
 import numpy as np
 
-from rigwake.bundle.covariance import covariance_of
-from rigwake.bundle.problem import BundleCamera, Landmarks, Observations, PoseMeasurements, RigProblem, States
-from rigwake.bundle.solver import solve
-from rigwake.cameras.kannala_brandt import KannalaBrandt4
+from rigwake._types import Array
+from rigwake.ba.solver.covariance import covariance_of
+from rigwake.ba.solver.levenberg_marquardt import solve
+from rigwake.ba.solver.rig_problem import (
+    BundleCamera,
+    Landmarks,
+    Observations,
+    PoseMeasurements,
+    RigProblem,
+    States,
+)
+from rigwake.cameras.models.kannala_brandt import KannalaBrandt4
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 
 LENS = KannalaBrandt4((200.0, 200.0, 320.0, 240.0, -0.01, 0.006, -0.003, 0.0005), 640, 480)
 FRAME_S, NOISE_PX, GNSS_STD, SEEN_ANGLE = 0.1, 0.3, 0.02, np.deg2rad(80.0)
@@ -160,9 +167,9 @@ def by_scipy(start: RigProblem) -> tuple[list[SE3], int]:
     from scipy.optimize import least_squares
     from scipy.sparse import csr_matrix
 
-    from rigwake.bundle.layout import retract, tangent_bases
-    from rigwake.bundle.problem import SolverOptions
-    from rigwake.bundle.solver import Linearisation, linearised, structure_of
+    from rigwake.ba.solver.levenberg_marquardt import Linearisation, linearised, structure_of
+    from rigwake.ba.solver.parameter_layout import retract, tangent_bases
+    from rigwake.ba.solver.rig_problem import SolverOptions
 
     options, structure = SolverOptions(loss="none"), structure_of(start)
     n, marks = structure.layout.n_columns, len(start.landmarks)

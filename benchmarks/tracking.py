@@ -24,17 +24,16 @@ import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-from rigwake.cameras.base import Mask
+from rigwake._types import Array, Image, Mask
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.readers.open import open_recording
 from rigwake.readers.trajectories import read_trajectory
-from rigwake.recording import CameraStream, Image, Recording
+from rigwake.recording import CameraStream, Recording
 from rigwake.tracking.features import detect_corners
 from rigwake.tracking.front_ends import track_camera
-from rigwake.tracking.hull import find_hull
 from rigwake.tracking.masks import inside, lens_mask
-from rigwake.tracking.options import TrackingOptions
+from rigwake.tracking.self_mask import find_self_mask
+from rigwake.tracking.tracking_options import TrackingOptions
 from rigwake.tracking.water import HorizonMask
 from rigwake.tracks import Tracks
 from tracking_scene import CylinderScene, fisheye, turning_scene, wall_points
@@ -193,7 +192,7 @@ def cylinder_errors(tracks: Tracks, scene: CylinderScene) -> Errors:
 
 
 def summary(errors: Errors, chosen: Array) -> str:
-    """Bias, RMS and robust deviation of the errors below 2 px, and the share of those above."""
+    """Bias, RMS and robust deviation of the errors below 2 px, and the fraction of those above."""
     error = errors.error_px[chosen]
     if len(error) < 30:
         return "-"
@@ -266,7 +265,7 @@ def cylinder(frames: int = 50) -> None:
 def masks(recording: Recording, folder: Path) -> None:
     print("\n### Masks on harbour_a, share of the labelled pixels and keypoints in the first frame\n")
     print(
-        "| camera | own hull found | land lost to hull mask | water masked | land above water lost to horizon "
+        "| camera | own hull found | land lost to self mask | water masked | land above water lost to horizon "
         "| keypoints on water or hull, no masks | with masks | CPU s |\n|---|---|---|---|---|---|---|---|"
     )
     for camera in CAMERAS:
@@ -275,7 +274,7 @@ def masks(recording: Recording, folder: Path) -> None:
         labels = cv2.imread(str(folder / f"truth_labels_{camera}.png"), cv2.IMREAD_GRAYSCALE)
         started = time.process_time()
         lens = lens_mask(stream)
-        hull = find_hull(stream, lens.usable)
+        hull = find_self_mask(stream, lens.usable)
         elapsed = time.process_time() - started
         up_cam = np.einsum("nji,j->ni", poses.rotation, UP)
         water = HorizonMask(stream.model).below(up_cam[0])

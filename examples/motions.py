@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from rigwake.calibration import CalibratedCamera
 from rigwake.errors import UnobservableError
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.calibrate import calibrate_handeye
-from rigwake.handeye.values import HandeyeOptions, NoiseLevel
+from rigwake.handeye.handeye_result import HandeyeOptions, NoiseLevel
+from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.trajectory import Trajectory
 
 RATE_HZ, DURATION_S = 10.0, 60.0
@@ -73,13 +73,13 @@ def verdict(world_from_boat: SE3, seed: int = 0) -> list[str]:
 def lines_of(camera: CalibratedCamera) -> list[str]:
     """Standard deviations of what is determined, and the words for what is not."""
     rotation = camera.std_rotation_deg
-    turned = f"± {np.nanmax(rotation):.2f}°" if np.isfinite(rotation).all() else "not determined"
+    turned = f"± {np.nanmax(rotation):.2f}°" if np.isfinite(rotation).all() else "unobservable"
     known = np.isfinite(camera.std_translation_m)
     offsets = [
         f"{n} {100 * s:.1f} cm" if np.isfinite(s) else f"{n} –"
         for n, s in zip("xyz", camera.std_translation_m, strict=True)
     ]
-    return [f"rotation {turned}", "offset ± " + ", ".join(offsets) if any(known) else "offset not determined"]
+    return [f"rotation {turned}", "offset ± " + ", ".join(offsets) if any(known) else "offset unobservable"]
 
 
 def eight(t: np.ndarray) -> np.ndarray:

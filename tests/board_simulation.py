@@ -3,11 +3,11 @@
 import cv2
 import numpy as np
 
-from rigwake.cameras.base import CameraModel
+from rigwake.cameras.protocol import CameraModel
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3, stack
+from rigwake.intrinsics.board_observations import BoardObservations, BoardView
 from rigwake.intrinsics.boards import Board
-from rigwake.intrinsics.observations import BoardObservations, BoardView
 
 
 def looking_poses(max_angle: float, count: int, rng: np.random.Generator, distance: float) -> SE3:

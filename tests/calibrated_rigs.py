@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from rigwake.calibration import CalibratedCamera, Calibration, UndeterminedDirection
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.catalogue import camera_from_params
+from rigwake.calibration import CalibratedCamera, Calibration, UnobservableDirection
+from rigwake.cameras.protocol import CameraModel
+from rigwake.cameras.registry import camera_from_params
 from rigwake.geometry.se3 import SE3
 
 FISHEYE = camera_from_params("kb4", [200.4, 201.4, 322.6, 236.9, -0.0115, 0.0062, -0.0034, 0.0005], 640, 480)
@@ -43,7 +43,7 @@ def boat(reference: str = "imu", lens: CameraModel | None = FISHEYE, **fields) -
 
 def without_vertical(calibration: Calibration, name: str) -> Calibration:
     """The same, but the motion left the vertical offset of one camera open."""
-    lost = UndeterminedDirection(VERTICAL, f"vertical offset of {name}", "record where waves roll the boat")
+    lost = UnobservableDirection(VERTICAL, f"vertical offset of {name}", "record where waves roll the boat")
     old = calibration.cameras[name]
     changed = CalibratedCamera(
         name,

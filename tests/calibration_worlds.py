@@ -7,24 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from rigwake.adjustment.values import RigMeasurements, RigStart
-from rigwake.bundle.problem import BundleCamera
+from rigwake.ba.rig.rig_values import InitialValues, RigMeasurements
+from rigwake.ba.solver.rig_problem import BundleCamera
 from rigwake.calibration import Calibration
 from rigwake.config import load_config
 from rigwake.errors import RigwakeError
-from rigwake.evaluate.calibrations import RigErrors, evaluate_calibration
+from rigwake.evaluation.rig_errors import RigErrors, evaluate_calibration
 from rigwake.geometry.se3 import SE3
-from rigwake.odometry.inertial import with_noise
+from rigwake.odometry.imu_alignment import with_noise
 from rigwake.odometry.monocular import estimate_monocular
-from rigwake.odometry.options import OdometryOptions
+from rigwake.odometry.odometry_options import OdometryOptions
 from rigwake.pipeline.prior import RigPrior
-from rigwake.pipeline.rig_stage import estimate_rig, start_rig
-from rigwake.pipeline.selection import select
-from rigwake.readers.truth import rig_in_frame
+from rigwake.pipeline.rig_stage import estimate_rig, initialise_rig
+from rigwake.pipeline.stream_selection import select
+from rigwake.readers.truth_files import rig_in_frame
 from rigwake.recording import Recording
 from rigwake.rig import Rig
-from rigwake.simulate.scenario import build_scenario, load_scenario
-from rigwake.simulate.tracks_only import SimulatedTracks, simulate_tracks
+from rigwake.simulation.scenario import build_scenario, load_scenario
+from rigwake.simulation.tracks_only import SimulatedTracks, simulate_tracks
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
@@ -56,7 +56,7 @@ def with_clocks(world: SimulatedTracks, offsets_ms: Mapping[str, float]) -> Simu
 
 def first_values(
     world: SimulatedTracks, seed: int = 0, turn_deg: float = 1.0, shift_m: float = 0.05
-) -> RigStart:
+) -> InitialValues:
     """The truth in the IMU's frame, with motion, mountings and antenna off at random."""
     recording, rng = world.recording, np.random.default_rng(seed)
     truth = rig_in_frame(recording.true_rig, "imu")
@@ -75,7 +75,7 @@ def first_values(
         for name, stream in recording.cameras.items()
     }
     trajectory = Trajectory("imu", body.timestamps_ns, world_from_imu)
-    return RigStart(trajectory, cameras, antenna_rig=truth.antenna_rig + rng.normal(0, 0.1, 3))
+    return InitialValues(trajectory, cameras, antenna_rig=truth.antenna_rig + rng.normal(0, 0.1, 3))
 
 
 def measurements(world: SimulatedTracks) -> RigMeasurements:
@@ -110,7 +110,7 @@ def own_odometry(world: SimulatedTracks) -> dict[str, Trajectory]:
 
 
 def true_odometry(world: SimulatedTracks, *, metric: bool) -> dict[str, Trajectory]:
-    """What a perfect foreign odometry reports: each camera in its own first frame, in metres or in its own unit."""
+    """What a perfect external odometry reports: each camera in its own first frame, in metres or in its own unit."""
     found = {}
     for index, name in enumerate(world.tracks):
         true = world.recording.true_trajectories[name]
@@ -131,13 +131,13 @@ def calibrated(
     trajectories: Mapping[str, Trajectory] | None = None,
     prior: RigPrior | None = None,
 ) -> Calibrated:
-    """From tracks to a rig, as `rigwake calibrate` does it, without landmarks handed over (they need images)."""
+    """From tracks to a rig, as `rigwake calibrate` does it, without landmarks associated across cameras (they need images)."""
     config = load_config(None, ("adjustment.cross_camera=false", *settings))
     recording: Recording = world.recording
     selection = select(recording, config)
     trajectories = own_odometry(world) if trajectories is None else trajectories
     prior = prior or RigPrior()
-    first = start_rig(selection, trajectories, config, prior)
+    first = initialise_rig(selection, trajectories, config, prior)
     tracks: Mapping[str, Tracks] = world.tracks
     rig = estimate_rig(recording, selection, tracks, first, config, prior, masks=Path("nowhere"))
     truth = rig_in_frame(recording.true_rig, rig.calibration.reference)

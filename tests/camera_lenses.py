@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from rigwake.cameras.catalogue import camera_from_params
-from rigwake.cameras.lens import Lens
+from rigwake.cameras.models.lens import Lens
+from rigwake.cameras.registry import camera_from_params
 
 
 def lens(model: str, params: list[float], fov_deg: float | None = None) -> Lens:

@@ -70,7 +70,7 @@ def jittered(poses: SE3, rotation_std: float, translation_std: float, rng: np.ra
 def lasting(
     poses: SE3, rotation_std: float, translation_std: float, memory: float, rng: np.random.Generator
 ) -> SE3:
-    """Errors of the poses that each keep the share `memory` of the one before."""
+    """Errors of the poses that each keep the fraction `memory` of the one before."""
     errors = _errors(len(poses), rotation_std, translation_std, rng)
     for k in range(1, len(errors)):
         errors[k] = memory * errors[k - 1] + np.sqrt(1 - memory**2) * errors[k]

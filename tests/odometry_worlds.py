@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.catalogue import camera_from_params
+from rigwake.cameras.protocol import CameraModel
+from rigwake.cameras.registry import camera_from_params
 from rigwake.geometry import so3
 from rigwake.geometry.interpolate import TransformSpline
 from rigwake.geometry.se3 import SE3
@@ -41,11 +41,11 @@ def tracks_of(
     points: int = 350,
     noise_px: float = 0.2,
     longest: int = 60,
-    wrong_share: float = 0.0,
+    wrong_fraction: float = 0.0,
 ) -> Tracks:
     """What a tracker would see of points on the walls of a harbour; tracks break after `longest` frames.
 
-    wrong_share: of tracks that wander over the image like water does.
+    wrong_fraction: of tracks that wander over the image like water does.
     """
     rng = np.random.default_rng(seed)
     bearing = rng.uniform(0, 2 * np.pi, points)
@@ -53,7 +53,7 @@ def tracks_of(
     cloud = np.stack(
         [distance * np.cos(bearing), distance * np.sin(bearing), rng.uniform(-1, 8, points)], axis=1
     )
-    wrong = rng.random(points) < wrong_share
+    wrong = rng.random(points) < wrong_fraction
     drift = rng.normal(0, 4.0, (points, 2))
     columns: list[list[np.ndarray]] = [[], [], [], []]
     for f in range(len(world_from_cam)):

@@ -13,7 +13,7 @@ from rigwake.calibration import Calibration, save_calibration
 from rigwake.geometry.se3 import SE3
 from rigwake.tracks import TrackingReport, Tracks
 from rigwake.trajectory import Trajectory
-from rigwake.writers.trajectories import write_tum
+from rigwake.writers.trajectory_writer import write_tum
 
 START_NS = 1_700_000_000_000_000_000
 GOOD_CHECKS = {

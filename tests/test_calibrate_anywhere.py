@@ -5,17 +5,17 @@ import pytest
 from scipy.stats import chi2
 
 from calibration_worlds import calibrated, first_values, measurements
-from rigwake.adjustment.assemble import assemble_problem
-from rigwake.adjustment.rounds import adjust
-from rigwake.adjustment.values import AdjustmentOptions
-from rigwake.adjustment.verdicts import ReferenceFrame, calibrated_cameras
-from rigwake.bundle.covariance import covariance_of
+from rigwake.ba.rig.assemble_problem import assemble_problem
+from rigwake.ba.rig.outlier_rounds import adjust
+from rigwake.ba.rig.rig_values import AdjustmentOptions
+from rigwake.ba.rig.rig_verdicts import ReferenceFrame, calibrated_cameras
+from rigwake.ba.solver.covariance import covariance_of
 from rigwake.calibration import Calibration
 from rigwake.geometry.se3 import SE3
-from rigwake.readers.truth import rig_in_frame
+from rigwake.readers.truth_files import rig_in_frame
 from rigwake.rig import Rig
-from rigwake.simulate.scenario import build_scenario, load_scenario
-from rigwake.simulate.tracks_only import SimulatedTracks, simulate_tracks
+from rigwake.simulation.scenario import build_scenario, load_scenario
+from rigwake.simulation.tracks_only import SimulatedTracks, simulate_tracks
 
 SEEDS = 20
 FEW = AdjustmentOptions(tracks_per_second=8)

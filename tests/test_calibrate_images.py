@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from rigwake.calibration import load_calibration
-from rigwake.evaluate.calibrations import evaluate_calibration
-from rigwake.readers.truth import rig_in_frame
+from rigwake.evaluation.rig_errors import evaluate_calibration
+from rigwake.readers.truth_files import rig_in_frame
 from rigwake.recording import Frame, FrameSource, Recording
-from rigwake.simulate.record import build_world, render_recording
-from rigwake.simulate.scenario import build_scenario, load_scenario
-from rigwake.simulate.setup import Simulation, build_recording, prepare
+from rigwake.simulation.record import build_world, render_recording
+from rigwake.simulation.scenario import build_scenario, load_scenario
+from rigwake.simulation.setup import Simulation, build_recording, prepare
 from rigwake.writers.write import write_recording
 
 SIZE = (420, 315)

@@ -17,11 +17,11 @@ from calibration_worlds import (
     true_odometry,
     with_clocks,
 )
-from rigwake.bundle.problem import VectorPrior
+from rigwake.ba.solver.rig_problem import VectorPrior
 from rigwake.errors import UnobservableError
 from rigwake.geometry.se3 import SE3
 from rigwake.pipeline.prior import Baseline, RigPrior, load_prior
-from rigwake.simulate.tracks_only import SimulatedTracks
+from rigwake.simulation.tracks_only import SimulatedTracks
 from rigwake.trajectory import Trajectory
 
 pytestmark = pytest.mark.slow
@@ -38,7 +38,7 @@ def odometry(world: SimulatedTracks) -> dict[str, Trajectory]:
 
 
 def assert_honest(found: Calibrated, most_deg: float, most_m: float) -> None:
-    """Errors below the bounds, and as large as promised: NEES below its 99.9 % quantile (22.5 for 6 axes)."""
+    """Errors below the bounds, and as large as assumed: NEES below its 99.9 % quantile (22.5 for 6 axes)."""
     for name, error in found.errors.cameras.items():
         assert error.rotation_error_deg <= most_deg
         assert np.nan_to_num(error.translation_error_norm_m) <= most_m
@@ -71,7 +71,7 @@ def test_with_what_is_at_hand(
     found = calibrated(world, *settings, trajectories=odometry)
     assert found.scale_source == scale
     assert found.calibration.reference in (reference, "front" if reference == "left" else reference)
-    assert all(camera.is_determined for camera in found.calibration.cameras.values())
+    assert all(camera.is_observable for camera in found.calibration.cameras.values())
     assert_honest(found, 0.1, 0.15)
 
 
@@ -80,8 +80,8 @@ def test_cameras_alone_give_rotations_and_say_what_is_missing(
 ) -> None:
     found = calibrated(world, "imu=false", "gnss=false", trajectories=odometry)
     (other,) = (c for n, c in found.calibration.cameras.items() if n != found.calibration.reference)
-    assert other.determined_axes.tolist() == [True] * 3 + [False] * 3
-    assert "scale" in other.undetermined[0].words
+    assert other.observable_axes.tolist() == [True] * 3 + [False] * 3
+    assert "scale" in other.unobservable[0].words
     assert_honest(found, 0.1, 0.0)
 
 
@@ -130,8 +130,8 @@ def test_a_prior_off_by_20_degrees_and_half_a_metre_leaves_the_optimum_where_it_
         }
     file = tmp_path / "tape.yaml"
     file.write_text(yaml.safe_dump({"cameras": entries}))
-    told = calibrated(world, trajectories=odometry, prior=load_prior(file))
-    for name, camera in told.calibration.cameras.items():
+    known_fraction = calibrated(world, trajectories=odometry, prior=load_prior(file))
+    for name, camera in known_fraction.calibration.cameras.items():
         moved = without.calibration.cameras[name].rig_from_cam.local(camera.rig_from_cam)
         assert np.abs(np.linalg.solve(np.linalg.cholesky(camera.covariance), moved)).max() < 0.5
 
@@ -169,8 +169,8 @@ def test_calm_water_never_tells_a_vertical_offset_that_is_wrong() -> None:
     found = calibrated(sail(sea=STILL_WATER))
     for error in found.errors.cameras.values():
         camera = found.calibration.cameras[error.name]
-        assert not camera.determined_axes[5]
+        assert not camera.observable_axes[5]
         known = np.isfinite(error.translation_error_m)
         assert (np.abs(error.translation_error_m[known]) < 3 * camera.std_translation_m[known]).all()
-        if camera.determined_axes[:3].all():
+        if camera.observable_axes[:3].all():
             assert error.rotation_error_deg < 3 * np.linalg.norm(camera.std_rotation_deg)

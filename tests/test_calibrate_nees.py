@@ -1,19 +1,19 @@
-"""Whether the promised doubt is honest, and whether the start matters: Monte Carlo on simulated tracks."""
+"""Whether the assumed uncertainty is honest, and whether the start matters: Monte Carlo on simulated tracks."""
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from calibration_worlds import first_values, measurements, sail
-from rigwake.adjustment.assemble import assemble_problem
-from rigwake.adjustment.rounds import adjust
-from rigwake.adjustment.values import AdjustmentOptions
-from rigwake.adjustment.verdicts import ReferenceFrame, calibrated_cameras
-from rigwake.bundle.covariance import covariance_of
+from rigwake.ba.rig.assemble_problem import assemble_problem
+from rigwake.ba.rig.outlier_rounds import adjust
+from rigwake.ba.rig.rig_values import AdjustmentOptions
+from rigwake.ba.rig.rig_verdicts import ReferenceFrame, calibrated_cameras
+from rigwake.ba.solver.covariance import covariance_of
 from rigwake.calibration import Calibration
 from rigwake.geometry.se3 import SE3
-from rigwake.readers.truth import rig_in_frame
-from rigwake.simulate.tracks_only import SimulatedTracks
+from rigwake.readers.truth_files import rig_in_frame
+from rigwake.simulation.tracks_only import SimulatedTracks
 
 OPTIONS = AdjustmentOptions(tracks_per_second=10)
 SEEDS = 24

@@ -7,9 +7,9 @@ import pytest
 
 from rigwake.calibration import Calibration
 from rigwake.config import load_config
-from rigwake.evaluate.calibrations import RigErrors, evaluate_calibration
-from rigwake.pipeline.calibrate import CalibrationRun, calibrate
-from rigwake.readers.truth import read_true_rig, rig_in_frame
+from rigwake.evaluation.rig_errors import RigErrors, evaluate_calibration
+from rigwake.pipeline.calibration_run import CalibrationRun, calibrate
+from rigwake.readers.truth_files import read_true_rig, rig_in_frame
 
 pytestmark = pytest.mark.slow
 

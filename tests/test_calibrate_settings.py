@@ -8,22 +8,22 @@ import pytest
 import yaml
 
 from calibration_worlds import first_values, measurements, sail
-from rigwake.adjustment.assemble import assemble_problem
-from rigwake.adjustment.start import FirstRig
-from rigwake.adjustment.values import AdjustmentOptions
-from rigwake.bundle.problem import PosePrior
+from rigwake._types import Array
+from rigwake.ba.rig.assemble_problem import assemble_problem
+from rigwake.ba.rig.initialisation import InitialRig
+from rigwake.ba.rig.rig_values import AdjustmentOptions
+from rigwake.ba.solver.rig_problem import PosePrior
 from rigwake.calibration import Calibration
 from rigwake.config import CalibrateConfig, load_config
 from rigwake.errors import InputError, UnobservableError, UsageError
 from rigwake.fingerprint import input_fingerprint
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.pipeline.outputs import horizon_pixels
 from rigwake.pipeline.prior import RigPrior, load_prior
-from rigwake.pipeline.selection import select
 from rigwake.pipeline.stage_files import StageLedger, stage_key
+from rigwake.pipeline.stream_selection import select
 from rigwake.recording import AttitudeStream
-from rigwake.simulate.tracks_only import SimulatedTracks
+from rigwake.simulation.tracks_only import SimulatedTracks
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +31,8 @@ def world() -> SimulatedTracks:
     return sail(features=30, duration_s=20)
 
 
-def first_rig_of(world: SimulatedTracks) -> FirstRig:
-    return FirstRig(first_values(world), Calibration("front", {}), "front", "gnss")
+def first_rig_of(world: SimulatedTracks) -> InitialRig:
+    return InitialRig(first_values(world), Calibration("front", {}), "front", "gnss")
 
 
 class TestSettings:

@@ -11,12 +11,12 @@ from geometry_strategies import transforms
 from rigwake.calibration import (
     CalibratedCamera,
     Calibration,
-    UndeterminedDirection,
+    UnobservableDirection,
     load_calibration,
     save_calibration,
 )
 from rigwake.calibration.yaml_file import calibration_from_dict, calibration_to_dict
-from rigwake.cameras.catalogue import camera_from_params
+from rigwake.cameras.registry import camera_from_params
 from rigwake.errors import InputError, UsageError
 from rigwake.geometry.se3 import SE3
 
@@ -33,8 +33,8 @@ def calibrated(name: str = "front", **fields) -> CalibratedCamera:
 
 def vertical_lost(
     camera: str = "front", direction: tuple[float, ...] = (0, 0, 0, 0, 0, 1)
-) -> UndeterminedDirection:
-    return UndeterminedDirection(
+) -> UnobservableDirection:
+    return UnobservableDirection(
         np.array(direction, float), f"vertical offset of {camera}", "record in waves"
     )
 
@@ -53,7 +53,7 @@ def test_everything_survives_the_file(tmp_path: Path) -> None:
         reference="imu",
         cameras={
             "front": calibrated(time_offset_s=0.012, time_offset_std_s=1e-4, statistics={"observations": 10}),
-            "port": calibrated("port", scale=2.5, scale_std=0.1, undetermined=(vertical_lost("port"),)),
+            "port": calibrated("port", scale=2.5, scale_std=0.1, unobservable=(vertical_lost("port"),)),
         },
         joint_covariance=np.diag(np.tile(STD**2, 2)),
         antenna_rig=np.array([-0.6, 0.3, 2.1]),
@@ -72,7 +72,7 @@ def test_everything_survives_the_file(tmp_path: Path) -> None:
     assert again.provenance == written.provenance
     port = again.camera("port")
     assert (port.scale, port.scale_std, port.time_offset_s) == (2.5, 0.1, None)
-    assert [d.words for d in port.undetermined] == ["vertical offset of port"]
+    assert [d.words for d in port.unobservable] == ["vertical offset of port"]
     front = read.camera("front")
     np.testing.assert_allclose(front.model.params, LENS.params)
     np.testing.assert_allclose(front.covariance, written.camera("front").covariance)
@@ -82,12 +82,12 @@ def test_everything_survives_the_file(tmp_path: Path) -> None:
 
 
 def test_a_lost_axis_has_no_number_anywhere() -> None:
-    camera = calibrated(undetermined=(vertical_lost(),))
+    camera = calibrated(unobservable=(vertical_lost(),))
     assert np.isnan(camera.rig_from_cam.translation[2])
     assert np.isfinite(camera.rig_from_cam.translation[:2]).all()
     assert np.isfinite(camera.rig_from_cam.rotation).all()
     assert np.isnan(camera.std_translation_m[2])
-    assert not camera.is_determined
+    assert not camera.is_observable
     content = calibration_to_dict(Calibration("imu", {"front": camera}))["cameras"]["front"]
     assert content["rig_from_cam"]["translation_m"][2] is None
     assert content["std_rig_axes"]["translation_m"][2] is None
@@ -98,7 +98,7 @@ def test_an_oblique_lost_direction_keeps_the_known_combination() -> None:
     """A reference camera pitched down 30 degrees: the rig's y and z both contain the vertical."""
     c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
     whole = calibrated()
-    camera = calibrated(undetermined=(vertical_lost(direction=(0, 0, 0, 0, c, s)),))
+    camera = calibrated(unobservable=(vertical_lost(direction=(0, 0, 0, 0, c, s)),))
     np.testing.assert_array_equal(np.isnan(camera.rig_from_cam.translation), [False, True, True])
     (known,) = camera.known_offsets
     np.testing.assert_allclose(np.abs(known.direction_rig @ [0, -s, c]), 1.0)
@@ -107,7 +107,7 @@ def test_an_oblique_lost_direction_keeps_the_known_combination() -> None:
 
 
 def test_a_lost_rotation_takes_the_whole_quaternion() -> None:
-    camera = calibrated(undetermined=(UndeterminedDirection(np.eye(6)[2], "heading of front"),))
+    camera = calibrated(unobservable=(UnobservableDirection(np.eye(6)[2], "heading of front"),))
     content = calibration_to_dict(Calibration("imu", {"front": camera}))["cameras"]["front"]
     assert content["rig_from_cam"]["quat_wxyz"] is None
     assert np.isnan(camera.std_rotation_deg).all()

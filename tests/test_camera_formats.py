@@ -1,4 +1,4 @@
-"""Foreign camera files: round trips, known values, and refusals."""
+"""External camera files: round trips, known values, and refusals."""
 
 from pathlib import Path
 
@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import yaml
 
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.catalogue import camera_from_dict, camera_from_params, camera_to_dict
-from rigwake.cameras.files import WRITERS, read_camera, read_cameras, write_cameras
-from rigwake.cameras.formats import camera_to_colmap
-from rigwake.cameras.ros import camera_from_info, info_from_camera
+from rigwake.cameras.formats.camera_dicts import camera_to_colmap
+from rigwake.cameras.formats.camera_files import WRITERS, read_camera, read_cameras, write_cameras
+from rigwake.cameras.formats.camera_info import camera_from_info, info_from_camera
+from rigwake.cameras.protocol import CameraModel
+from rigwake.cameras.registry import camera_from_dict, camera_from_params, camera_to_dict
 from rigwake.errors import CameraError, InputError, UsageError
 
 KB4 = camera_from_params("kb4", [200.4, 201.1, 322.6, 236.9, -0.0115, 0.0062, -0.0034, 0.0005], 640, 480)

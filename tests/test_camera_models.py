@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from camera_lenses import LENSES, lens, rays_within, reach_of
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.catalogue import CAMERA_CLASSES, camera_from_params
-from rigwake.cameras.kernels import build_kernels
-from rigwake.cameras.lens import Lens
+from rigwake.cameras.models.lens import Lens
+from rigwake.cameras.models.projection_kernels import build_kernels
+from rigwake.cameras.protocol import CameraModel
+from rigwake.cameras.registry import CAMERA_CLASSES, camera_from_params
 from rigwake.errors import CameraError
 
 every_lens = pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES.keys())
@@ -169,7 +169,7 @@ def test_opencv_omnidir_agrees_beyond_90_degrees() -> None:
 
 @pytest.mark.parametrize("name", ["pinhole", "rational", "kb4 195", "fov 195"])
 def test_colmap_agrees(name: str) -> None:
-    from rigwake.cameras.formats import camera_to_colmap
+    from rigwake.cameras.formats.camera_dicts import camera_to_colmap
 
     camera = LENSES[name]
     if "skew" in camera.param_names:

@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 
 from calibrated_rigs import PINHOLE, boat, without_vertical
 from rigwake.calibration import load_calibration, save_calibration
-from rigwake.cameras.catalogue import camera_to_dict
+from rigwake.cameras.registry import camera_to_dict
 from rigwake.cli.main import build_app
-from rigwake.evaluate.calibrations import evaluate_calibration
-from rigwake.readers.truth import read_true_rig, rig_in_frame
+from rigwake.evaluation.rig_errors import evaluate_calibration
+from rigwake.readers.truth_files import read_true_rig, rig_in_frame
 
 ROOT = Path(__file__).parent.parent
 WHOLE_WAY, *EXAMPLES = re.findall(
@@ -64,7 +64,7 @@ def test_the_whole_way_says_what_a_recording_lacks(
 def test_a_notebook_shows_a_table_without_made_up_numbers() -> None:
     rig = without_vertical(boat(), "port")
     assert rig._repr_html_().count("<tr>") == 5
-    assert "port: x y z 410.0 ± 4, 830.0 ± 11, not determined mm" in repr(rig)
+    assert "port: x y z 410.0 ± 4, 830.0 ± 11, unobservable mm" in repr(rig)
     assert "nan" not in rig._repr_html_() + repr(rig)
 
 
@@ -134,8 +134,8 @@ def test_the_motions_of_the_picture_determine_what_the_page_says(
     monkeypatch.setattr("sys.argv", ["motions.py", str(tmp_path / "motions.png")])
     runpy.run_path(str(ROOT / "examples" / "motions.py"), run_name="__main__")
     straight, circle, calm, waves = capsys.readouterr().out.splitlines()
-    assert "rotation not determined; offset not determined" in straight
-    assert "rotation not determined; offset not determined" in circle
+    assert "rotation unobservable; offset unobservable" in straight
+    assert "rotation unobservable; offset unobservable" in circle
     assert "rotation ±" in calm
     assert "z –" in calm
     assert re.search(r"rotation ± .*x [\d.]+ cm, y [\d.]+ cm, z [\d.]+ cm", waves)

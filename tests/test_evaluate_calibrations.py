@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import typer
 
-from rigwake.calibration import CalibratedCamera, Calibration, UndeterminedDirection, save_calibration
-from rigwake.cameras.catalogue import camera_from_params
+from rigwake.calibration import CalibratedCamera, Calibration, UnobservableDirection, save_calibration
+from rigwake.cameras.registry import camera_from_params
 from rigwake.cli import console
 from rigwake.cli.calibrate import print_calibration
 from rigwake.cli.main import build_app, main
 from rigwake.errors import InputError
-from rigwake.evaluate.calibrations import compare_calibrations, evaluate_calibration
+from rigwake.evaluation.rig_errors import compare_calibrations, evaluate_calibration
 from rigwake.geometry.se3 import SE3
-from rigwake.readers.truth import read_true_rig, rig_in_frame
+from rigwake.readers.truth_files import read_true_rig, rig_in_frame
 from rigwake.rig import Rig, RigCamera
 
 STD = np.array([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03])
@@ -75,9 +75,9 @@ def test_alignment_removes_the_motion_of_the_whole_rig() -> None:
 
 
 def test_an_undetermined_axis_has_no_error_and_does_not_count() -> None:
-    lost = UndeterminedDirection(np.eye(6)[5], "vertical offset of front")
+    lost = UnobservableDirection(np.eye(6)[5], "vertical offset of front")
     found = calibration()
-    cameras = {**found.cameras, "front": replace(found.cameras["front"], undetermined=(lost,))}
+    cameras = {**found.cameras, "front": replace(found.cameras["front"], unobservable=(lost,))}
     e = evaluate_calibration(replace(found, cameras=cameras), TRUTH).to_json()["cameras"]["front"]
     assert e["translation_error_m"][2] is None
     assert e["translation_error_norm_m"] is None
@@ -147,9 +147,9 @@ def test_tables_fit_a_terminal_of_80_columns(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     a, b = tmp_path / "a.yaml", tmp_path / "b.yaml"
-    lost = UndeterminedDirection(np.eye(6)[5], "vertical offset of front")
+    lost = UnobservableDirection(np.eye(6)[5], "vertical offset of front")
     moved = calibration({"port": 3 * STD})
-    front = replace(moved.cameras["front"], undetermined=(lost,))
+    front = replace(moved.cameras["front"], unobservable=(lost,))
     save_calibration(calibration(), a)
     save_calibration(replace(moved, cameras={**moved.cameras, "front": front}), b)
     monkeypatch.setattr(console.out, "width", 80)

@@ -13,23 +13,23 @@ from typer.testing import CliRunner
 from calibrated_rigs import FISHEYE, PINHOLE, boat, camera, without_vertical
 from geometry_strategies import transforms
 from rigwake.calibration import Calibration, save_calibration
-from rigwake.cameras.catalogue import camera_from_params
+from rigwake.cameras.registry import camera_from_params
 from rigwake.cli.main import build_app
 from rigwake.errors import CameraError, InputError, RigwakeError, UnobservableError, UsageError
 from rigwake.exporters import (
     FORMATS,
+    ExportedImuNoise,
     ExportOptions,
-    ImuNoise,
     export_calibration,
     in_common_frame,
     read_calibration,
 )
 from rigwake.exporters.basalt import read_imu_noise
-from rigwake.exporters.base import refer_to_camera
+from rigwake.exporters.export_base import refer_to_camera
 from rigwake.geometry.euler import rotation_from_yaw_pitch_roll, yaw_pitch_roll
 from rigwake.geometry.se3 import SE3
 
-OPTIONS = ExportOptions(imu=ImuNoise(0.01, 0.001, 0.002, 0.0001, 200.0))
+OPTIONS = ExportOptions(imu=ExportedImuNoise(0.01, 0.001, 0.002, 0.0001, 200.0))
 HOLD_NO_NULL = [name for name, f in FORMATS.items() if not f.holds_null]
 TF_SUFFIXES = ("tf.launch", "tf.launch.py", "tf.bag", "tf.mcap", "tf_folder")
 FILES = [(name, f.usual_file.rstrip("/")) for name, f in FORMATS.items()] + [
@@ -114,7 +114,7 @@ def test_undetermined_cameras_are_refused_or_left_out(tmp_path: Path, name: str)
         export_calibration(rig, name, target, OPTIONS)
     assert "record where waves roll the boat" in refused.value.remedy
     assert not target.exists()
-    notes = export_calibration(rig, name, target, OPTIONS, allow_undetermined=True)
+    notes = export_calibration(rig, name, target, OPTIONS, allow_unobservable=True)
     assert any("left out" in note and "vertical offset of port" in note for note in notes)
     assert len(read_calibration(target).cameras) == 3
     texts = [target] if target.is_file() else list(target.iterdir())
@@ -130,7 +130,7 @@ def test_tables_hold_what_is_determined(tmp_path: Path, name: str) -> None:
     assert not re.search(r"\bnan\b", (tmp_path / f"rig.{name}").read_text(), re.IGNORECASE)
     port = read_calibration(tmp_path / f"rig.{name}").cameras["port"]
     np.testing.assert_allclose(port.rig_from_cam.translation, [0.41, 0.83, np.nan])
-    assert not port.is_determined
+    assert not port.is_observable
 
 
 def test_nothing_determined_is_refused_even_when_allowed(tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ def test_nothing_determined_is_refused_even_when_allowed(tmp_path: Path) -> None
     for name in rig.cameras:
         rig = without_vertical(rig, name)
     with pytest.raises(UnobservableError, match="No camera is left"):
-        export_calibration(rig, "urdf", tmp_path / "rig.urdf", allow_undetermined=True)
+        export_calibration(rig, "urdf", tmp_path / "rig.urdf", allow_unobservable=True)
 
 
 def test_lenses_are_converted_with_their_residual(tmp_path: Path) -> None:
@@ -168,7 +168,7 @@ def test_a_refusal_leaves_nothing_and_old_files_are_named(tmp_path: Path) -> Non
     assert list(tmp_path.iterdir()) == []
     export_calibration(boat(), "opencv", tmp_path)
     (note,) = export_calibration(
-        without_vertical(boat(), "aft"), "opencv", tmp_path, allow_undetermined=True
+        without_vertical(boat(), "aft"), "opencv", tmp_path, allow_unobservable=True
     )[1:]
     assert "aft.yaml was there before" in note
 
@@ -276,7 +276,7 @@ def test_imu_noise_of_kalibr_and_openvins(tmp_path: Path) -> None:
     }
     (tmp_path / "imu.yaml").write_text(json.dumps(values))
     (tmp_path / "chain.yaml").write_text(json.dumps({"imu0": values}))
-    expected = ImuNoise(0.01, 1e-3, 2e-3, 1e-4, 200.0)
+    expected = ExportedImuNoise(0.01, 1e-3, 2e-3, 1e-4, 200.0)
     assert read_imu_noise(tmp_path / "imu.yaml") == expected
     assert read_imu_noise(tmp_path / "chain.yaml") == expected
     (tmp_path / "imu.yaml").write_text("update_rate: 200")

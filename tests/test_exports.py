@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from calibrated_rigs import FISHEYE, PINHOLE, boat
 from rigwake.calibration import Calibration
-from rigwake.exporters import ExportOptions, ImuNoise, export_calibration
+from rigwake.exporters import ExportedImuNoise, ExportOptions, export_calibration
 
-IMU = ImuNoise(0.01, 0.001, 0.002, 0.0001, 200.0, "/imu")
+IMU = ExportedImuNoise(0.01, 0.001, 0.002, 0.0001, 200.0, "/imu")
 POINT_CAM = np.array([1.3, -0.4, 2.1])  # in front of each camera, and inside its image
 
 

@@ -1,4 +1,4 @@
-"""`calibrate_handeye`: exact without noise, honest with it, and never a figure that was not determined."""
+"""`calibrate_handeye`: exact without noise, honest with it, and never a figure that was unobservable."""
 
 import numpy as np
 import pytest
@@ -20,8 +20,8 @@ from handeye_scenes import (
 )
 from rigwake.errors import UnobservableError, UsageError
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.calibrate import calibrate_handeye
-from rigwake.handeye.values import HandeyeOptions, NoiseLevel
+from rigwake.handeye.handeye_result import HandeyeOptions, NoiseLevel
+from rigwake.handeye.joint_calibration import calibrate_handeye
 
 TIMES = np.arange(300) * 0.1
 SYNCHRONOUS = HandeyeOptions(time_offset=False)
@@ -117,7 +117,7 @@ def test_scale_of_every_segment():
     assert np.abs(errors(PORT, result.ref_from_members["port"])).max() < 1e-8
 
 
-def test_members_are_solved_jointly_and_share_the_noise_of_the_reference():
+def test_members_are_solved_jointly_and_fraction_the_noise_of_the_reference():
     starboard = camera(-90, 15, [0.0, -1.2, 1.4])
     rng = np.random.default_rng(5)
     poses = [wavy(TIMES) * X for X in (SE3.identity(), PORT, starboard)]
@@ -171,8 +171,8 @@ def test_open_axes_are_marked_and_the_others_right(name, noise):
     motion, open_axes = DEGENERATE[name]
     result = calibrate_handeye(*_one(pair(motion, noise)))
     port = result.members["port"]
-    assert set(np.flatnonzero(~port.determined_axes)) == open_axes
-    known = port.determined_axes
+    assert set(np.flatnonzero(~port.observable_axes)) == open_axes
+    known = port.observable_axes
     variances = np.where(known, np.diag(np.nan_to_num(port.covariance_rig_axes)), 1.0)
     if known[:3].all():
         off = errors(PORT, result.ref_from_members["port"])[known]
@@ -180,7 +180,7 @@ def test_open_axes_are_marked_and_the_others_right(name, noise):
     else:
         assert np.isnan(port.rig_from_cam.rotation).all()
     assert np.isnan(port.rig_from_cam.translation[[i - 3 for i in open_axes if i > 2]]).all()
-    assert all(d.words and d.remedy for d in port.undetermined)
+    assert all(d.words and d.remedy for d in port.unobservable)
 
 
 def test_standing_still_is_refused():
@@ -198,7 +198,7 @@ def test_noise_does_not_feign_roll_and_pitch():
     """Planar motion whose attitude noise is as large as waves would be: the vertical offset stays open."""
     for seed in range(5):
         result = calibrate_handeye(*_one(pair(planar, (jittered, 5e-3, 1e-2), seed=seed)))
-        assert not result.members["port"].determined_axes[Z]
+        assert not result.members["port"].observable_axes[Z]
 
 
 def test_monocular_reference_is_refused():
@@ -211,6 +211,6 @@ def test_monocular_reference_is_refused():
 
 
 def test_seed_is_right_without_noise_and_says_nothing_about_doubt():
-    result = calibrate_handeye(*_one(pair(wavy)), HandeyeOptions(method="seed", time_offset=False))
+    result = calibrate_handeye(*_one(pair(wavy)), HandeyeOptions(method="thesis", time_offset=False))
     assert np.abs(errors(PORT, result.ref_from_members["port"])).max() < 1e-6
     assert np.isnan(result.members["port"].covariance).all()

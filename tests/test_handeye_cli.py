@@ -13,7 +13,7 @@ from rigwake.calibration import load_calibration
 from rigwake.cli.main import main
 from rigwake.geometry.se3 import SE3
 from rigwake.readers.open import open_recording
-from rigwake.writers import trajectories
+from rigwake.writers import trajectory_writer
 
 TIMES = np.arange(200) * 0.1
 
@@ -75,7 +75,7 @@ def test_pose_topic_of_a_bag(tmp_path, run, real_recordings):
     odometry = open_recording(bag).poses["odom"]
     camera = replace(odometry, name="port", world_from_body=odometry.world_from_body * PORT, covariances=None)
     file, output = tmp_path / "port.tum", tmp_path / "calibration.yaml"
-    trajectories.write_tum(camera, file)
+    trajectory_writer.write_tum(camera, file)
     assert run(f"{bag}:/no/such/topic", file)[0] == 2
     code, printed = run(f"{bag}:{topic}", file, "--json", "-", "-o", output)
     assert code == 0

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from geometry_strategies import transforms
 from rigwake.geometry.se3 import SE3
 from rigwake.handeye.closed_forms import CLOSED_FORMS
-from rigwake.handeye.seed import linear_handeye
+from rigwake.handeye.thesis_handeye import linear_handeye
 
 SOLVERS = {**CLOSED_FORMS, "seed": linear_handeye}
 

@@ -9,8 +9,8 @@ from geometry_strategies import transforms
 from handeye_scenes import PORT, drifting, trajectory, wavy
 from rigwake.geometry.se3 import SE3
 from rigwake.handeye import kernels, noise_kernels, normal_kernels
-from rigwake.handeye.motions import Layout, Mounting, linearise, residuals, steps_between
-from rigwake.handeye.resample import Curve
+from rigwake.handeye.motions import Mounting, MountingLayout, linearise, residuals, steps_between
+from rigwake.handeye.resample import TrajectoryCurve
 
 TIMES = np.arange(40) * 0.1
 
@@ -38,14 +38,16 @@ def _identities(count):
 def _pair():
     rng = np.random.default_rng(3)
     poses = [drifting(wavy(TIMES) * X, 1e-3, 1e-2, rng) for X in (SE3.identity(), PORT)]
-    return [Curve.of(trajectory(n, p, TIMES)) for n, p in zip(("rig", "port"), poses, strict=True)]
+    return [TrajectoryCurve.of(trajectory(n, p, TIMES)) for n, p in zip(("rig", "port"), poses, strict=True)]
 
 
 @pytest.mark.parametrize("absolute", [False, True])
 def test_jacobians_are_derivatives_where_the_noise_is_small(absolute):
     body = wavy(TIMES)
-    reference, member = (Curve.of(trajectory("x", body * X, TIMES)).at_poses for X in (SE3.identity(), PORT))
-    layout = Layout(1 if absolute else 0, False, 1)
+    reference, member = (
+        TrajectoryCurve.of(trajectory("x", body * X, TIMES)).at_poses for X in (SE3.identity(), PORT)
+    )
+    layout = MountingLayout(1 if absolute else 0, False, 1)
     start = Mounting(PORT, SE3.identity((1,)) if absolute else None, 0.0, np.zeros(1))
     steps = steps_between(reference, member, absolute)
     J = linearise(steps, start, layout, np.zeros((len(steps.valid), 6))).jacobians
@@ -89,7 +91,7 @@ def test_what_noise_feigns_is_the_mean_of_squared_changes():
     rng = np.random.default_rng(1)
     covariance, W = 1e-2 * _spd(rng, 6), _spd(rng, 6)
     X = SE3.exp(rng.normal(size=(1, 6)))
-    found = normal_kernels.feigned(
+    found = normal_kernels.spurious(
         covariance[None],
         W[None],
         X.adjoint(),

@@ -7,18 +7,18 @@ from hypothesis import strategies as st
 
 from handeye_scenes import camera, drifting, jittered, trajectory, wavy
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.calibrate import calibrate_handeye
+from rigwake.handeye.handeye_result import HandeyeOptions, NoiseLevel
+from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.handeye.lever_arm import levels_by_lever_arm
-from rigwake.handeye.values import HandeyeOptions, NoiseLevel
 
 POSES = 176
 TIMES = np.arange(POSES) * 0.2
 
 
-def residuals(share, rotation_std, translation_std, arm, count, rng):
+def residuals(fraction, rotation_std, translation_std, arm, count, rng):
     """Rows `[r_R, r_t]`: rotation errors of both sides, of which the reference's swing the arm."""
     reference, own = (
-        rng.normal(size=(count, 3)) * rotation_std * np.sqrt(part) for part in (share, 1 - share)
+        rng.normal(size=(count, 3)) * rotation_std * np.sqrt(part) for part in (fraction, 1 - fraction)
     )
     moved = np.cross(arm, reference) + rng.normal(size=(count, 3)) * translation_std
     return np.hstack([reference + own, moved])
@@ -26,29 +26,33 @@ def residuals(share, rotation_std, translation_std, arm, count, rng):
 
 @settings(max_examples=30, deadline=None)
 @given(
-    share=st.floats(0.05, 0.95),
+    fraction=st.floats(0.05, 0.95),
     length=st.floats(1.0, 12.0),
-    swing=st.floats(1.0, 30.0),
+    arm_variance=st.floats(1.0, 30.0),
     seed=st.integers(0, 1000),
 )
-def test_share_and_level_are_found(share, length, swing, seed):
+def test_fraction_and_level_are_found(fraction, length, arm_variance, seed):
     rng = np.random.default_rng(seed)
     arm = rng.normal(size=3)
     arm *= length / np.linalg.norm(arm)
-    rotation_std = 1e-3 * swing / length  # moves the member by `swing` times its own error of 1 mm
-    rows = residuals(share, rotation_std, 1e-3, arm, 3000, rng)
+    rotation_std = (
+        1e-3 * arm_variance / length
+    )  # moves the member by `arm_variance` times its own error of 1 mm
+    rows = residuals(fraction, rotation_std, 1e-3, arm, 3000, rng)
     found = levels_by_lever_arm(rows, arm, rotation_std**2)
-    assert found.share == pytest.approx(share, abs=0.12)
+    assert found.fraction == pytest.approx(fraction, abs=0.12)
     assert found.translation == pytest.approx(1e-6, rel=0.15)
-    # a share known from elsewhere gives the level that goes with it
-    assert levels_by_lever_arm(rows, arm, rotation_std**2, share).translation == pytest.approx(1e-6, rel=0.15)
+    # a fraction known from elsewhere gives the level that goes with it
+    assert levels_by_lever_arm(rows, arm, rotation_std**2, fraction).translation == pytest.approx(
+        1e-6, rel=0.15
+    )
 
 
-def test_a_short_arm_leaves_the_share_in_the_middle():
+def test_a_short_arm_leaves_the_fraction_in_the_middle():
     rng = np.random.default_rng(0)
     for arm in (np.zeros(3), np.array([1e-3, 0, 0])):
         found = levels_by_lever_arm(residuals(0.0, 1e-3, 1e-2, arm, 500, rng), arm, 1e-6)
-        assert found.share == pytest.approx(0.5, abs=0.05)
+        assert found.fraction == pytest.approx(0.5, abs=0.05)
         assert found.translation == pytest.approx(1e-4, rel=0.15)
 
 
@@ -59,7 +63,7 @@ def test_gross_outliers_do_not_move_the_levels():
     clean = levels_by_lever_arm(rows, arm, 1e-6)
     rows[::100] += 3.0
     found = levels_by_lever_arm(rows, arm, 1e-6)
-    assert found.share == pytest.approx(clean.share, abs=0.1)
+    assert found.fraction == pytest.approx(clean.fraction, abs=0.1)
     assert found.translation < 1.5 * clean.translation
 
 
@@ -90,19 +94,19 @@ def errors(learnt, sides, mountings, draws=25):
 def test_learnt_noise_is_as_good_as_told_whichever_side_is_better(sides, arm_m):
     mountings = [camera(90, 15, [arm_m, 1.2, 1.4])]
     learnt, nees = errors(True, sides, mountings)
-    told, _ = errors(False, sides, mountings)
-    rmse, best = (np.sqrt(np.mean(e**2, axis=0)).reshape(2, 3).max(axis=1) for e in (learnt, told))
+    known_fraction, _ = errors(False, sides, mountings)
+    rmse, best = (np.sqrt(np.mean(e**2, axis=0)).reshape(2, 3).max(axis=1) for e in (learnt, known_fraction))
     assert np.all(rmse < 1.25 * best)
     assert 3.0 < np.mean(nees) < 9.0  # 6 is expected
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sides", [(1e-5, 1e-3), (1e-3, 1e-5)])
-def test_members_together_tell_whose_errors_they_share(sides):
+def test_members_together_tell_whose_errors_they_fraction(sides):
     mountings = [camera(yaw, 15, [8.0, y, 1.4]) for yaw, y in ((90, 1.2), (-90, -1.2), (0, 0.0))]
     learnt, nees = errors(True, sides, mountings, draws=10)
-    told, _ = errors(False, sides, mountings, draws=10)
-    rmse, best = (np.sqrt(np.mean(e**2, axis=0)).reshape(2, 3).max(axis=1) for e in (learnt, told))
+    known_fraction, _ = errors(False, sides, mountings, draws=10)
+    rmse, best = (np.sqrt(np.mean(e**2, axis=0)).reshape(2, 3).max(axis=1) for e in (learnt, known_fraction))
     assert np.all(rmse < 1.4 * best)
     assert 3.0 < np.mean(nees) < 9.0
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from calibration_worlds import first_values, measurements, sail
-from rigwake.adjustment.assemble import assemble_problem
-from rigwake.adjustment.imu_noise import imu_noise_factors, with_imu_noise
-from rigwake.adjustment.rounds import adjust
-from rigwake.adjustment.values import AdjustmentOptions
+from rigwake.ba.rig.assemble_problem import assemble_problem
+from rigwake.ba.rig.imu_noise import imu_noise_factors, with_imu_noise
+from rigwake.ba.rig.outlier_rounds import adjust
+from rigwake.ba.rig.rig_values import AdjustmentOptions
 
 OPTIONS = AdjustmentOptions(state_rate_hz=3.0, tracks_per_second=20, rounds=4)
 # coarse enough for the cameras to see it between two states
@@ -17,7 +17,7 @@ COARSE = {"gyro_noise_density": 2e-3, "accel_noise_density": 0.3}
 
 
 def factors_found(gyro: float, accel: float) -> dict[str, float]:
-    """Of an IMU whose promise is better than its noise by these factors."""
+    """Of an IMU whose predict is better than its noise by these factors."""
     world = sail(features=50, imu=COARSE)
     measured = measurements(world)
     assembled = assemble_problem(measured, first_values(world), OPTIONS)

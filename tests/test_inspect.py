@@ -12,17 +12,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from rigwake.cameras.kannala_brandt import KannalaBrandt4
+from rigwake.cameras.models.kannala_brandt import KannalaBrandt4
 from rigwake.cli.main import build_app
 from rigwake.geometry import so3
-from rigwake.inspection.clocks import camera_offset, gnss_offset
-from rigwake.inspection.inspect import inspect_recording
-from rigwake.inspection.motion import levelled_rotations, travel, turning
-from rigwake.inspection.page import inspection_page
-from rigwake.inspection.pictures import Pictures, camera_turn
-from rigwake.inspection.summary import inspection_to_dict
+from rigwake.inspection.inspection_page import inspection_page
+from rigwake.inspection.inspection_summary import inspection_to_dict
+from rigwake.inspection.picture_samples import Pictures, camera_rotation
+from rigwake.inspection.readiness import judge
+from rigwake.inspection.recording_inspection import inspect_recording
+from rigwake.inspection.time_offsets import camera_offset, gnss_offset
 from rigwake.inspection.timing import timing
-from rigwake.inspection.verdict import judge
+from rigwake.inspection.vessel_motion import levelled_rotations, travel, turning
 from rigwake.readers.open import open_recording
 from rigwake.recording import CameraStream, Frame, GnssStream, ImuStream, Recording
 
@@ -89,11 +89,11 @@ def test_camera_clock_is_recovered_within_its_sigmas(offset_ms: int, seed: int) 
     ]
     noisy = turns + rng.normal(0, 1e-3, turns.shape)
     pictures = Pictures(80, 80, 0, 0, 0, 100.0, stamps[0], stamps[1], noisy)
-    clock = camera_offset("front", pictures, imu)
-    assert clock.offset_s is not None
-    assert clock.std_s is not None
-    assert clock.std_s < 0.01
-    assert abs(clock.offset_s - offset_ms * 1e-3) < max(4.5 * clock.std_s, 2e-3)
+    time_offset = camera_offset("front", pictures, imu)
+    assert time_offset.offset_s is not None
+    assert time_offset.std_s is not None
+    assert time_offset.std_s < 0.01
+    assert abs(time_offset.offset_s - offset_ms * 1e-3) < max(4.5 * time_offset.std_s, 2e-3)
 
 
 def test_a_clock_is_not_stated_where_the_motion_does_not_agree() -> None:
@@ -116,11 +116,11 @@ def test_gnss_clock_is_recovered_within_its_sigmas(offset_s: float) -> None:
     gnss = GnssStream(
         "gnss", stamps, turned, np.tile(np.eye(3) * 1e-4, (len(times), 1, 1)), (57.0, 11.0, 0.0)
     )
-    clock = gnss_offset(gnss, imu)
-    assert clock.offset_s is not None
-    assert clock.std_s is not None
-    assert abs(clock.offset_s - offset_s) < max(4 * clock.std_s, 0.02)
-    assert clock.std_s < 0.2
+    time_offset = gnss_offset(gnss, imu)
+    assert time_offset.offset_s is not None
+    assert time_offset.std_s is not None
+    assert abs(time_offset.offset_s - offset_s) < max(4 * time_offset.std_s, 0.02)
+    assert time_offset.std_s < 0.2
 
 
 @given(
@@ -164,7 +164,7 @@ def rendered(rotation: NDArray[np.float64]) -> NDArray[np.uint8]:
 def test_camera_turn_is_measured_from_two_images() -> None:
     turn = np.array([0.01, -0.03, 0.02])
     start = so3.exp([0.1, 0.2, 0.3])
-    measured = camera_turn(rendered(start), rendered(start @ so3.exp(turn)), LENS)
+    measured = camera_rotation(rendered(start), rendered(start @ so3.exp(turn)), LENS)
     assert measured is not None
     assert np.abs(measured - turn).max() < 1e-3
 
@@ -255,10 +255,10 @@ def test_harbour_is_enough_and_its_clocks_agree(real_recordings: Path, tmp_path:
     inspection = inspect_recording(open_recording(real_recordings / "harbour_a" / "harbour_a.bag"))
     assert judge(inspection).word == "enough"
     for key in ("camera.front", "camera.left", "camera.back", "camera.right", "gnss.gps"):
-        clock = inspection.clocks[key]
-        assert clock.offset_s is not None
-        assert clock.std_s is not None
-        assert abs(clock.offset_s) < 4 * clock.std_s + 0.002  # the true offsets are zero
+        time_offset = inspection.time_offsets[key]
+        assert time_offset.offset_s is not None
+        assert time_offset.std_s is not None
+        assert abs(time_offset.offset_s) < 4 * time_offset.std_s + 0.002  # the true offsets are zero
     assert inspection.travel is not None
     assert inspection.travel.path_m == pytest.approx(72.3, rel=0.05)
     page = inspection_page(inspection, judge(inspection))

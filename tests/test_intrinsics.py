@@ -1,4 +1,4 @@
-"""Intrinsic calibration without a first guess: recovery, doubt, outliers, and refusals."""
+"""Intrinsic calibration without an initial guess: recovery, uncertainty, outliers, and refusals."""
 
 import gzip
 from dataclasses import replace
@@ -10,18 +10,18 @@ import yaml
 from typer.testing import CliRunner
 
 from board_simulation import centred_points, looking_poses, render_board, simulated_corners
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.catalogue import camera_from_params
-from rigwake.cameras.files import read_camera
+from rigwake.cameras.formats.camera_files import read_camera
+from rigwake.cameras.protocol import CameraModel
+from rigwake.cameras.registry import camera_from_params
 from rigwake.cli.main import build_app
 from rigwake.errors import EstimationError, InputError, UnobservableError, UsageError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
+from rigwake.intrinsics.board_calibration import IntrinsicCalibration, axis_focal_px, calibrate
+from rigwake.intrinsics.board_observations import BoardObservations, BoardView, read_corner_file
 from rigwake.intrinsics.board_pose import board_pose
 from rigwake.intrinsics.boards import Board, parse_board
-from rigwake.intrinsics.calibrate import IntrinsicCalibration, axis_focal_px, calibrate
 from rigwake.intrinsics.detect import detect_board, detect_corners
-from rigwake.intrinsics.observations import BoardObservations, BoardView, read_corner_file
 from rigwake.intrinsics.select import choose, cross_validate
 
 BOARD = parse_board("aprilgrid:6x6:0.088:0.3")
@@ -61,7 +61,7 @@ def test_a_190_degree_lens_is_found_without_a_guess(model: str) -> None:
     assert result.sigma_px == pytest.approx(NOISE_PX, rel=0.05)
     assert result.max_observed_angle > np.deg2rad(93)
     assert result.converged
-    assert not result.undetermined
+    assert not result.unobservable
     assert not result.dropped_views
 
 
@@ -94,12 +94,12 @@ def sheared(observations: BoardObservations, seed: int, std: float) -> BoardObse
     return replace(observations, views=views)
 
 
-def test_errors_that_the_corners_of_a_view_share_widen_the_covariance() -> None:
+def test_errors_that_the_corners_of_a_view_fraction_widen_the_covariance() -> None:
     truth = wide_lens("kb4")
     results = [calibrate(sheared(draw(truth, seed), seed, 3e-3), "kb4") for seed in range(4)]
     nees = np.array([normalised_error(result, truth)[1] for result in results])
     widening = np.array([result.widening for result in results])
-    assert np.mean(widening * nees) > 10 * 8  # what independent corners promise: ten times too much
+    assert np.mean(widening * nees) > 10 * 8  # what independent corners predict: ten times too much
     assert np.mean(nees) < 2 * 8
     assert calibrate(draw(truth, 0), "kb4").widening < 1.3
 
@@ -206,7 +206,7 @@ def test_a_parameter_without_effect_is_flagged_not_printed() -> None:
         "kb23",
     )
     flagged = {name for name, std in result.stds.items() if not np.isfinite(std)}
-    assert flagged == set(result.undetermined)
+    assert flagged == set(result.unobservable)
     assert flagged
 
 

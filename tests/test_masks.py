@@ -6,7 +6,6 @@ import pytest
 
 from rigwake.errors import EstimationError, InputError, UnobservableError, UsageError
 from rigwake.readers.open import open_recording
-from rigwake.tracking.hull import find_hull
 from rigwake.tracking.masks import (
     CameraMask,
     beyond_image_circle,
@@ -15,6 +14,7 @@ from rigwake.tracking.masks import (
     lens_mask,
     mask_from_file,
 )
+from rigwake.tracking.self_mask import find_self_mask
 from rigwake.tracking.water import HorizonMask
 from tracking_scene import fisheye, stream_of, turning_scene
 
@@ -32,25 +32,25 @@ def test_hull_is_what_stays_put():
     truth = np.zeros((120, 160), np.uint8)
     cv2.fillPoly(truth, [np.array([[60, 119], [80, 70], [110, 119]])], 1)
     images[:, truth > 0] = np.where(np.arange(120) % 20 < 10, 230, 190)[:, None].repeat(160, 1)[truth > 0]
-    hull = find_hull(stream_of(images), np.ones((120, 160), dtype=bool))
+    hull = find_self_mask(stream_of(images), np.ones((120, 160), dtype=bool))
     assert hull[truth > 0].mean() > 0.98
     assert hull[truth == 0].mean() < 0.06
 
 
 def test_without_a_hull_nothing_is_masked():
-    hull = find_hull(stream_of(scrolling()), np.ones((120, 160), dtype=bool))
+    hull = find_self_mask(stream_of(scrolling()), np.ones((120, 160), dtype=bool))
     assert hull.mean() < 0.01
 
 
 def test_a_boat_that_does_not_turn_shows_no_hull():
     still = np.repeat(scrolling(1), 20, axis=0)
     with pytest.raises(UnobservableError, match="stands still"):
-        find_hull(stream_of(still), np.ones((120, 160), dtype=bool))
+        find_self_mask(stream_of(still), np.ones((120, 160), dtype=bool))
 
 
 def test_too_few_frames_for_a_hull():
     with pytest.raises(EstimationError, match="only 5 images"):
-        find_hull(stream_of(scrolling(5)), np.ones((120, 160), dtype=bool))
+        find_self_mask(stream_of(scrolling(5)), np.ones((120, 160), dtype=bool))
 
 
 def test_image_circle_is_found_by_its_darkness():
@@ -139,7 +139,7 @@ def test_hull_of_the_harbour_recording(real_recordings, camera):
     stream = next(s for name, s in recording.cameras.items() if camera in name)
     labels = cv2.imread(str(folder / f"truth_labels_{camera}.png"), cv2.IMREAD_GRAYSCALE)
     usable = lens_mask(stream).usable
-    hull = find_hull(stream, usable)
+    hull = find_self_mask(stream, usable)
     assert (hull | ~usable)[labels == 240].mean() > 0.97
     assert hull[labels == 60].mean() < 0.01
     assert hull[labels == 180].mean() < 0.08

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rigwake.evaluate.trajectories import absolute_error
-from rigwake.odometry.camera import run_camera
+from rigwake.evaluation.trajectory_errors import absolute_error
+from rigwake.odometry.camera_odometry import run_camera
 from rigwake.readers.open import open_recording
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.recording import Frame

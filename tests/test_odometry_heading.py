@@ -19,7 +19,7 @@ NOISE = np.deg2rad(1.0)
 
 @pytest.fixture(scope="module")
 def seen():
-    """Tracks, lens, visual odometry, IMU and first values in a level world of arbitrary heading."""
+    """Tracks, lens, visual odometry, IMU and initial values in a level world of arbitrary heading."""
     truth, imu = rig_path(), sensors_of()[0]
     tracks = tracks_of(truth.world_from_body * RIG_FROM_CAM, fisheye())
     tracks = replace(tracks, timestamps_ns=truth.timestamps_ns - round(TIME_OFFSET_S * 1e9))

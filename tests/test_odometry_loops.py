@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from odometry_worlds import circling, fisheye, tracks_of
-from rigwake.evaluate.trajectories import absolute_error
+from rigwake.evaluation.trajectory_errors import absolute_error
 from rigwake.odometry.loop_closure import LoopOptions, closed_path, find_loops, joined_tracks
 from rigwake.odometry.monocular import estimate_monocular, readjust
 from rigwake.odometry.result import OdometryResult

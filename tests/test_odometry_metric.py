@@ -17,13 +17,13 @@ from odometry_worlds import (
     visual_path,
 )
 from rigwake.errors import UnobservableError, UsageError
-from rigwake.evaluate.trajectories import absolute_error
+from rigwake.evaluation.trajectory_errors import absolute_error
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.odometry.gnss import align_gnss, in_enu
+from rigwake.odometry.gravity_alignment import up_in_camera
 from rigwake.odometry.gyro import align_gyro, camera_rotations, integrate_gyro
-from rigwake.odometry.inertial import align_inertial
-from rigwake.odometry.level import up_in_camera
+from rigwake.odometry.imu_alignment import align_inertial
 from rigwake.odometry.metric import metric_start
 from rigwake.trajectory import Trajectory
 

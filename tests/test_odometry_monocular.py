@@ -7,10 +7,10 @@ import pytest
 
 from odometry_worlds import circling, fisheye, tracks_of
 from rigwake.errors import EstimationError, UsageError
-from rigwake.evaluate.trajectories import absolute_error
+from rigwake.evaluation.trajectory_errors import absolute_error
 from rigwake.geometry.se3 import SE3
 from rigwake.odometry.monocular import estimate_monocular
-from rigwake.odometry.options import OdometryOptions
+from rigwake.odometry.odometry_options import OdometryOptions
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
@@ -46,7 +46,7 @@ def test_recovers_the_path_up_to_scale_with_points_beyond_90_degrees():
 @pytest.mark.slow
 def test_wandering_tracks_are_not_inliers():
     world_from_cam, camera = circling(FRAMES), fisheye()
-    tracks = tracks_of(world_from_cam, camera, wrong_share=0.4, points=600)
+    tracks = tracks_of(world_from_cam, camera, wrong_fraction=0.4, points=600)
     result = estimate_monocular(tracks, camera)
     error = absolute_error(truth(tracks, world_from_cam), result.trajectory, alignment="sim3")
     assert len(result.trajectory) == FRAMES
@@ -57,7 +57,7 @@ def test_wandering_tracks_are_not_inliers():
 @pytest.mark.slow
 def test_inliers_are_rows_of_the_tracks_as_given():
     world_from_cam, camera = circling(60), fisheye()
-    tracks = tracks_of(world_from_cam, camera, wrong_share=0.2)
+    tracks = tracks_of(world_from_cam, camera, wrong_fraction=0.2)
     shuffled = np.random.default_rng(1).permutation(len(tracks))
     plain = estimate_monocular(tracks, camera)
     mixed = estimate_monocular(tracks.take(shuffled), camera)

@@ -9,9 +9,9 @@ from typer.testing import CliRunner
 
 from rigwake.cli.main import build_app
 from rigwake.errors import UsageError
-from rigwake.evaluate.trajectories import absolute_error
+from rigwake.evaluation.trajectory_errors import absolute_error
 from rigwake.geometry import so3
-from rigwake.odometry.camera import CameraOdometryOptions, run_camera
+from rigwake.odometry.camera_odometry import CameraOdometryOptions, run_camera
 from rigwake.odometry.stereo import estimate_stereo
 from rigwake.readers.open import open_recording
 from rigwake.readers.trajectories import read_trajectory

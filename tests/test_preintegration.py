@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import yaml
 
-from bundle_rigs import ACCEL_NOISE, GYRO_NOISE, stamps
-from bundle_rigs import Path as BoatPath
-from rigwake.bundle.inertial import inertial_rows
-from rigwake.bundle.layout import layout_of
-from rigwake.bundle.preintegration import Preintegrated, preintegrate
-from rigwake.bundle.problem import InertialStates, Landmarks, Observations, RigProblem, States
+from ba_rigs import ACCEL_NOISE, GYRO_NOISE, stamps
+from ba_rigs import Path as BoatPath
+from rigwake.ba.solver.imu_factors import inertial_rows
+from rigwake.ba.solver.parameter_layout import layout_of
+from rigwake.ba.solver.preintegration import Preintegrated, preintegrate
+from rigwake.ba.solver.rig_problem import InertialStates, Landmarks, Observations, RigProblem, States
 from rigwake.errors import UsageError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3

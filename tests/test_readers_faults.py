@@ -14,12 +14,12 @@ import zstandard
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 
 from rigwake.errors import InputError, RigwakeError, UsageError
-from rigwake.inspection.inspect import inspect_recording
+from rigwake.inspection.recording_inspection import inspect_recording
 from rigwake.readers.images import ImageSize, compressed_size, decode_compressed, decode_raw
 from rigwake.readers.open import open_recording
 from rigwake.readers.topics import TopicMap
 from rigwake.recording import Recording
-from rigwake.writers.ros_messages import MessageFactory
+from rigwake.writers.ros_encoding import MessageFactory
 from rigwake.writers.rosbag import _Topic, _write, write_rosbag1
 from rigwake.writers.write import write_recording
 from test_writers import FRAMES, START_NS, small_recording
@@ -110,16 +110,16 @@ def test_paths_that_are_no_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["rec.bag", "lz4.bag", "bz2.bag", "rec.mcap"])
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.95, 0.999])
-def test_truncated_bags_keep_what_they_hold(good: Path, tmp_path: Path, name: str, share: float) -> None:
+@pytest.mark.parametrize("fraction", [0.3, 0.6, 0.95, 0.999])
+def test_truncated_bags_keep_what_they_hold(good: Path, tmp_path: Path, name: str, fraction: float) -> None:
     content = (good / name).read_bytes()
     path = tmp_path / name
-    path.write_bytes(content[: int(share * len(content))])
+    path.write_bytes(content[: int(fraction * len(content))])
     recording = open_recording(path)
     assert any(f.severity == "error" for f in recording.findings)
     frames = drain(recording)
     assert frames <= 2 * FRAMES
-    if share > 0.9 and name in ("rec.bag", "rec.mcap"):
+    if fraction > 0.9 and name in ("rec.bag", "rec.mcap"):
         assert frames == 2 * FRAMES  # only the index is gone
 
 
@@ -338,12 +338,12 @@ def test_chunk_that_claims_to_unpack_to_gigabytes(good: Path, tmp_path: Path) ->
 
 
 def test_truncated_sqlite_bag(good: Path, tmp_path: Path) -> None:
-    for share in (0.05, 0.5, 0.9):
-        folder = tmp_path / f"cut{share}"
+    for fraction in (0.05, 0.5, 0.9):
+        folder = tmp_path / f"cut{fraction}"
         shutil.copytree(good / "sqlite", folder)
         (file,) = folder.glob("*.db3")
         content = file.read_bytes()
-        file.write_bytes(content[: int(share * len(content))])
+        file.write_bytes(content[: int(fraction * len(content))])
         try:
             recording = open_recording(folder)
         except InputError:

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from calibrated_rigs import boat, camera, without_vertical
 from report_folders import GOOD_CHECKS, circle, many_cameras, write_folder, write_residuals, write_tracks
-from rigwake.calibration import CalibratedCamera, Calibration, UndeterminedDirection, save_calibration
+from rigwake.calibration import CalibratedCamera, Calibration, UnobservableDirection, save_calibration
 from rigwake.cli.main import build_app
 from rigwake.errors import InputError, UsageError
 from rigwake.geometry.se3 import SE3
@@ -24,10 +24,10 @@ from rigwake.report import build_report, load_report_content, summary_lines
 from rigwake.report.charts import Series, line_chart, ticks
 from rigwake.report.extrinsics import directions, looks, two_digits
 from rigwake.report.figures import write_figures
-from rigwake.report.motion import motion_of, paths_in_one_world
-from rigwake.report.pictures import BUDGET_BYTES
+from rigwake.report.motion_figures import motion_of, paths_in_one_world
+from rigwake.report.picture_overlays import BUDGET_BYTES
+from rigwake.report.report_verdict import judge
 from rigwake.report.rerun_log import log_to_rerun
-from rigwake.report.verdict import judge
 
 
 @pytest.fixture(scope="module")
@@ -56,14 +56,14 @@ def test_everything_has_a_panel(page: str) -> None:
         "Clocks",
         "Reprojection residuals",
         "Two halves of the recording",
-        "Hand-over between cameras",
-        "Hand-over pictures",
+        "Cross-camera association between cameras",
+        "Cross-camera association pictures",
         "Horizon",
         "Motion of the rig",
         "Coverage of the images",
         "Masks",
         "Where this comes from",
-        "From the first guess to the result",
+        "From the initial guess to the result",
     ):
         assert f">{heading}</h" in page, heading
     assert "left out" not in page
@@ -158,26 +158,26 @@ def test_what_is_not_determined_has_no_number(tmp_path: Path) -> None:
         tmp_path / "calibration.yaml",
     )
     text = build_report(tmp_path).read_text()
-    assert "not determined" in text
+    assert "unobservable" in text
     assert "Record where waves roll the boat." in text
     assert "1234.6" not in text
     assert "1.23457" not in text
     assert "nan" not in re.sub(r"[A-Za-z]+nan|nan[A-Za-z]+", "", text)
     forward, backward = directions(load_report_content(tmp_path).calibration.cameras["port"])
-    assert [v.is_determined for v in forward.position] == [True, True, False]
-    assert not any(v.is_determined for v in backward.position)
+    assert [v.is_observable for v in forward.position] == [True, True, False]
+    assert not any(v.is_observable for v in backward.position)
     assert forward.copies == backward.copies == ()
-    assert all(v.is_determined for v in forward.angles)
+    assert all(v.is_observable for v in forward.angles)
 
 
 def test_an_unknown_rotation_has_no_angles(tmp_path: Path) -> None:
-    lost = UndeterminedDirection(np.eye(6)[2], "heading of front")
+    lost = UnobservableDirection(np.eye(6)[2], "heading of front")
     blind = CalibratedCamera("front", SE3.identity(), np.eye(6), (lost,))
     save_calibration(Calibration("imu", {"front": blind}), tmp_path / "calibration.yaml")
     assert "heading of front" in build_report(tmp_path).read_text()
     forward, _ = directions(blind)
-    assert not any(v.is_determined for v in (*forward.angles, *forward.quat_wxyz))
-    assert "not determined" in looks(blind, "imu")
+    assert not any(v.is_observable for v in (*forward.angles, *forward.quat_wxyz))
+    assert "unobservable" in looks(blind, "imu")
 
 
 def test_sigmas_of_the_inverse_are_those_of_a_monte_carlo() -> None:
@@ -232,7 +232,7 @@ def test_an_imprecise_calibration_is_usable_only() -> None:
     verdict = judge(replace(rig, cameras=wide))
     assert verdict.level == "usable"
     assert sum("good means at most" in reason.words for reason in verdict.reasons) == 2
-    assert judge(without_vertical(rig, "aft")).level == "not determined"
+    assert judge(without_vertical(rig, "aft")).level == "unobservable"
     unknown = {name: replace(c, covariance=np.full((6, 6), np.nan)) for name, c in rig.cameras.items()}
     assert judge(replace(rig, cameras=unknown)).level == "usable"
 

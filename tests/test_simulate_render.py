@@ -9,24 +9,24 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from camera_lenses import LENSES
-from rigwake.cameras.catalogue import CAMERA_CLASSES
+from rigwake.cameras.registry import CAMERA_CLASSES
 from rigwake.cli.main import build_app
 from rigwake.readers.open import open_recording
-from rigwake.readers.truth import read_true_rig
-from rigwake.simulate.hull import build_hull
-from rigwake.simulate.imaging import develop, vignetting
-from rigwake.simulate.layout import build_layout
-from rigwake.simulate.record import Shot, build_world, render_recording, work_folder
-from rigwake.simulate.render import Renderer
-from rigwake.simulate.scenario import ImageNoise, Scenario, Scene, Sea, build_scenario, load_scenario
-from rigwake.simulate.sea_surface import meet_water, water_at
-from rigwake.simulate.selfcheck import corner_errors, motion_agreement
-from rigwake.simulate.setup import Simulation, prepare
-from rigwake.simulate.shading import HULL, LAND, SKY, WATER
-from rigwake.simulate.skyline import gather_boxes, in_band, seen_band
-from rigwake.simulate.textures import build_atlas
-from rigwake.simulate.truth import truth_to_dict, write_truth
-from rigwake.simulate.waves import build_wave_field
+from rigwake.readers.truth_files import read_true_rig
+from rigwake.simulation.hull_mesh import build_hull
+from rigwake.simulation.imaging import develop, vignetting
+from rigwake.simulation.record import Shot, build_world, render_recording, work_folder
+from rigwake.simulation.render import Renderer
+from rigwake.simulation.scenario import ImageNoise, Scenario, Scene, Sea, build_scenario, load_scenario
+from rigwake.simulation.scene_layout import build_layout
+from rigwake.simulation.sea_surface import meet_water, water_at
+from rigwake.simulation.selfcheck import corner_errors, motion_agreement
+from rigwake.simulation.setup import Simulation, prepare
+from rigwake.simulation.shading import HULL, LAND, SKY, WATER
+from rigwake.simulation.skyline import gather_boxes, in_band, seen_band
+from rigwake.simulation.textures import build_atlas
+from rigwake.simulation.truth_writer import truth_to_dict, write_truth
+from rigwake.simulation.waves import build_wave_field
 
 
 def small(**changes: object) -> Scenario:
@@ -202,8 +202,8 @@ def test_land_moves_as_geometry_says_and_water_does_not(demo_world: tuple[Simula
         shot, exact = (Shot.prepare(simulation, renderer, number, samples) for samples in (None, 1))
         agreement = motion_agreement(shot, exact, 20 + 15 * number, 21 + 15 * number)
         flow.append(agreement.flow_error_px)
-        land.append((agreement.land_share, agreement.land_tracks))
-        water.append((agreement.water_share, agreement.water_tracks))
+        land.append((agreement.land_fraction, agreement.land_tracks))
+        water.append((agreement.water_fraction, agreement.water_tracks))
     assert np.median(np.concatenate(flow)) < 0.1
     on_land, on_water = np.array(land), np.array(water)
     assert np.average(on_land[:, 0], weights=on_land[:, 1]) >= 0.98
@@ -216,11 +216,11 @@ def test_labels_show_land_sky_water_and_the_own_hull(demo_world: tuple[Simulatio
     simulation, renderer = demo_world
     shot = Shot.prepare(simulation, renderer, 0, samples=1)
     seen = renderer.truth(shot.view, shot.row_poses(5.0), renderer.water(5.0))
-    share = {label: float(np.mean(seen.labels == label)) for label in (LAND, SKY, WATER, HULL)}
-    assert share[LAND] > 0.05
-    assert share[SKY] > 0.2
-    assert share[WATER] > 0.2
-    assert 0.01 < share[HULL] < 0.3
+    fraction = {label: float(np.mean(seen.labels == label)) for label in (LAND, SKY, WATER, HULL)}
+    assert fraction[LAND] > 0.05
+    assert fraction[SKY] > 0.2
+    assert fraction[WATER] > 0.2
+    assert 0.01 < fraction[HULL] < 0.3
     assert np.isfinite(seen.ranges_m[seen.labels == LAND]).all()
     assert np.isnan(seen.ranges_m[seen.labels == HULL]).all()
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rigwake.errors import UsageError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.simulate.scenario import (
+from rigwake.simulation.scenario import (
     Imu,
     Scenario,
     Sea,
@@ -19,10 +19,10 @@ from rigwake.simulate.scenario import (
     parse_scenario,
     preset_names,
 )
-from rigwake.simulate.sensors import imu_mounting, simulate_imu
-from rigwake.simulate.setup import Simulation, prepare
-from rigwake.simulate.tracks_only import simulate_tracks
-from rigwake.simulate.waves import GRAVITY, HullResponse, WaveField, build_wave_field, raft_motion
+from rigwake.simulation.sensors import imu_mounting, simulate_imu
+from rigwake.simulation.setup import Simulation, prepare
+from rigwake.simulation.tracks_only import simulate_tracks
+from rigwake.simulation.waves import GRAVITY, SelfMaskResponse, WaveField, build_wave_field, raft_motion
 
 
 def changed(scenario: Scenario, **changes: object) -> Scenario:
@@ -103,7 +103,7 @@ def test_a_small_raft_rides_the_surface_that_is_seen() -> None:
     field = build_wave_field(Sea(hs_m=0.4, tp_s=4.0), 3)
     long_waves = WaveField(field.tiles[:1])
     tile = field.tiles[0]
-    raft = HullResponse(0.05, 0.05, (1, 1, 1), (1, 1, 1))
+    raft = SelfMaskResponse(0.05, 0.05, (1, 1, 1), (1, 1, 1))
     for t in (0.0, 3.7):
         surface = tile.surface(t)
         cell = tile.length_m / len(surface)

@@ -8,7 +8,7 @@ import pytest
 from rigwake.errors import InputError, UsageError
 from rigwake.recording import CameraStream
 from rigwake.tracking.front_ends import track_camera
-from rigwake.tracking.options import TrackingOptions
+from rigwake.tracking.tracking_options import TrackingOptions
 from rigwake.tracks import Tracks, load_tracks
 from tracking_scene import CylinderScene, turning_scene, wall_points
 
@@ -149,7 +149,7 @@ def test_displacement_gates_and_region_of_interest():
 
 def test_few_points_are_taken_high_above_the_horizon(hard_scene, hard_stream, hard_tracks):
     up_cam = np.tile([0.0, -1.0, 0.0], (len(hard_stream), 1))
-    tracks = track_camera(hard_stream, TrackingOptions(max_high_share=0.05), up_cam=up_cam)
+    tracks = track_camera(hard_stream, TrackingOptions(max_high_fraction=0.05), up_cam=up_cam)
     first = np.unique(tracks.track_ids, return_index=True)[1]
     high = -tracks.bearings_cam[:, 1] > np.sin(np.deg2rad(16.0))
     freely = -hard_tracks.bearings_cam[:, 1] > np.sin(np.deg2rad(16.0))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rigwake import threads
-from rigwake.geometry.so3 import Array
+from rigwake import parallel
+from rigwake._types import Array
 from rigwake.tracking.klt import follow, pyramid
 from tracking_scene import random_texture
 
@@ -76,7 +76,7 @@ def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     alone, many = [], []
     for workers, into in ((1, alone), (4, many)):
         with ThreadPoolExecutor(workers) as pool, monkeypatch.context() as patch:
-            patch.setattr(threads, "_threads", lambda pool=pool: pool)
+            patch.setattr(parallel, "_threads", lambda pool=pool: pool)
             into += followed(BEFORE, after, GRID, GRID)
     assert np.array_equal(alone[0], many[0])
     assert np.array_equal(alone[1], many[1])

@@ -141,7 +141,7 @@ def test_rotation_warp_is_the_derivative_of_where_pixels_go(turn):
     stencils, valid = stencil_bearings(model, pixels)
     assert valid.all()
     bearings, _ = model.unproject(pixels)
-    warps, bends, good = rotation_warps(
+    warps, second_order, good = rotation_warps(
         model, stencils, np.broadcast_to(rotation, (3, 3, 3)), bearings @ rotation.T
     )
     assert good.all()
@@ -153,10 +153,10 @@ def test_rotation_warp_is_the_derivative_of_where_pixels_go(turn):
     numeric = np.stack([(moved([h, 0]) - moved([-h, 0])), (moved([0, h]) - moved([0, -h]))], axis=2) / (2 * h)
     np.testing.assert_allclose(warps, numeric, atol=2e-3)
     here, h = moved([0, 0]), 0.5
-    bend_xx, bend_yy = ((moved(h * e) + moved(-h * e) - 2 * here) / h**2 for e in np.eye(2))
+    second_xx, second_yy = ((moved(h * e) + moved(-h * e) - 2 * here) / h**2 for e in np.eye(2))
     corners = [moved([h * x, h * y]) * x * y for x in (-1, 1) for y in (-1, 1)]
-    second = np.stack([bend_xx, sum(corners) / (2 * h) ** 2, bend_yy], axis=2)
-    np.testing.assert_allclose(bends, second, atol=2e-4)
+    second = np.stack([second_xx, sum(corners) / (2 * h) ** 2, second_yy], axis=2)
+    np.testing.assert_allclose(second_order, second, atol=2e-4)
 
 
 @given(st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)), st.integers(0, 100))

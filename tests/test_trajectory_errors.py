@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from rigwake.errors import InputError
-from rigwake.evaluate.trajectories import absolute_error, kitti_error, relative_error
+from rigwake.evaluation.trajectory_errors import absolute_error, kitti_error, relative_error
 from rigwake.geometry.se3 import SE3
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.trajectory import Trajectory
-from rigwake.writers.trajectories import write_tum
+from rigwake.writers.trajectory_writer import write_tum
 
 
 @pytest.fixture(scope="module")

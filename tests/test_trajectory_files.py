@@ -8,7 +8,7 @@ from rigwake.errors import InputError, TrajectoryError
 from rigwake.geometry.se3 import SE3
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.trajectory import Trajectory
-from rigwake.writers.trajectories import write_tum
+from rigwake.writers.trajectory_writer import write_tum
 
 ROWS = [f"{1000 + i}.5 {i} 0 0 0 0 0 1" for i in range(5)]
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from camera_lenses import LENSES
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.catalogue import camera_from_params
 from rigwake.cameras.convert import convert_camera
-from rigwake.cameras.lens import Lens
-from rigwake.cameras.undistort import Cylinder, Equirectangular, View, covering_views, remap_table
+from rigwake.cameras.models.lens import Lens
+from rigwake.cameras.protocol import CameraModel
+from rigwake.cameras.registry import camera_from_params
+from rigwake.cameras.undistort import Cylinder, Equirectangular, ViewGeometry, covering_views, remap_table
 from rigwake.errors import CameraError
 from rigwake.geometry import so3
 
@@ -33,7 +33,7 @@ def direction_image(camera: CameraModel, channel: int) -> np.ndarray:
 
 @pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS.keys())
 @pytest.mark.parametrize("channel", [0, 1, 2])
-def test_every_pixel_of_a_view_shows_its_own_ray(view: View, channel: int) -> None:
+def test_every_pixel_of_a_view_shows_its_own_ray(view: ViewGeometry, channel: int) -> None:
     table = remap_table(FISHEYE, view, TURN)
     assert table.mask.any()
     shown = table.apply(direction_image(FISHEYE, channel)).astype(float)
@@ -46,7 +46,7 @@ def test_every_pixel_of_a_view_shows_its_own_ray(view: View, channel: int) -> No
 
 
 @pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS.keys())
-def test_views_invert_themselves(view: View) -> None:
+def test_views_invert_themselves(view: ViewGeometry) -> None:
     rng = np.random.default_rng(0)
     pixels = rng.uniform([0, 0], [view.width_px - 1, view.height_px - 1], (200, 2))
     rays, valid = view.unproject(pixels)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rigwake.cameras.kannala_brandt import KannalaBrandt4
+from rigwake.cameras.models.kannala_brandt import KannalaBrandt4
 from rigwake.errors import UsageError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.inspection.inspect import inspect_recording
+from rigwake.inspection.recording_inspection import inspect_recording
 from rigwake.readers.open import open_recording
 from rigwake.recording import (
     AttitudeStream,

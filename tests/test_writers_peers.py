@@ -13,9 +13,9 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 
 from rigwake.geometry.se3 import SE3
 from rigwake.readers.open import open_recording
-from rigwake.readers.ros_messages import typestore
+from rigwake.readers.ros_decoding import typestore
 from rigwake.recording import static_transform
-from rigwake.writers.ros_messages import MessageFactory
+from rigwake.writers.ros_encoding import MessageFactory
 from rigwake.writers.rosbag import _Topic, _write, write_rosbag1
 from rigwake.writers.write import write_recording
 from test_writers import FRAMES, small_recording

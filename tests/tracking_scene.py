@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.kannala_brandt import KannalaBrandt4
+from rigwake._types import Array
+from rigwake.cameras.models.kannala_brandt import KannalaBrandt4
+from rigwake.cameras.protocol import CameraModel
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.recording import CameraStream, Frame
 from rigwake.tracking.masks import pixel_grid
 

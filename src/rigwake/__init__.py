@@ -26,7 +26,7 @@ def calibrate(recording: Path | str, out: Path | str = "rigwake-out", **settings
     Raises the errors of `rigwake.errors`, UnobservableError when the motion cannot tell.
     """
     from rigwake.config import load_config
-    from rigwake.pipeline.calibrate import calibrate as run
+    from rigwake.pipeline.calibration_run import calibrate as run
 
     return run(recording, out, load_config(**settings)).calibration
 

@@ -9,12 +9,12 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from rigwake.adjustment.proposals import HandOverOptions
-from rigwake.adjustment.values import AdjustmentOptions
+from rigwake.ba.rig.rig_values import AdjustmentOptions
+from rigwake.ba.rig.search_proposals import AssociationOptions
 from rigwake.errors import UsageError
-from rigwake.odometry.options import OdometryOptions
-from rigwake.readers.truth import read_yaml_mapping
-from rigwake.tracking.options import TrackingOptions
+from rigwake.odometry.odometry_options import OdometryOptions
+from rigwake.readers.truth_files import read_yaml_mapping
+from rigwake.tracking.tracking_options import TrackingOptions
 
 
 class ImuNoiseSettings(BaseModel):
@@ -33,7 +33,7 @@ class ImuNoiseSettings(BaseModel):
 class CalibrateConfig(BaseModel):
     """Everything that can be chosen about `rigwake calibrate`.
 
-    reference: `imu`, `base_link`, a camera's name, or `auto` (the IMU, else the leading camera).
+    reference: `imu`, `base_link`, a camera's name, or `auto` (the IMU, else the reference camera).
     cameras: which to calibrate (all by default). start_s, duration_s: the part of the recording to use.
     jobs: processes (0: as many as there are cores). seed: of everything random.
     time_offsets: estimate the cameras' clocks. imu, gnss: whether to use them.
@@ -51,15 +51,15 @@ class CalibrateConfig(BaseModel):
     time_offsets: bool = True
     imu: bool = True
     gnss: bool = True
-    find_hull: bool = True
+    find_self_mask: bool = True
     line_delay_s: dict[str, float] = Field(default_factory=dict)
     estimate_line_delay: bool = False
     imu_noise: ImuNoiseSettings = ImuNoiseSettings()
     tracking: TrackingOptions = TrackingOptions()
-    # the rig adjustment follows, so the odometry of a camera need not be perfect
+    # the rig bundle adjustment follows, so the odometry of a camera need not be perfect
     odometry: OdometryOptions = OdometryOptions(adjust_all_frames=False)
     adjustment: AdjustmentOptions = AdjustmentOptions()
-    hand_over: HandOverOptions = HandOverOptions()
+    association: AssociationOptions = AssociationOptions()
 
 
 def load_config(file: Path | None = None, assignments: Sequence[str] = (), **options: Any) -> CalibrateConfig:

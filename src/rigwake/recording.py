@@ -13,15 +13,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.cameras.base import CameraModel
+from rigwake._types import Array, Image, Stamps
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import UsageError
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.rig import Rig
 from rigwake.trajectory import Trajectory
-
-Stamps = NDArray[np.int64]
-Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)

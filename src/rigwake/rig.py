@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rigwake.cameras.base import CameraModel
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import UsageError
 from rigwake.geometry.se3 import SE3
 

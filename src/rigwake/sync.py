@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
+from rigwake._types import Array
 from rigwake.errors import UnobservableError
 from rigwake.geometry import so3
-from rigwake.geometry.so3 import Array
 from rigwake.trajectory import Trajectory
 
 Spectrum = NDArray[np.complex128]

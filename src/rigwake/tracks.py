@@ -10,11 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._types import Array, Indices
 from rigwake.atomic import atomic_path
 from rigwake.errors import InputError
-from rigwake.geometry.so3 import Array
-
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

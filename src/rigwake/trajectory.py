@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._types import Array
 from rigwake.errors import TrajectoryError
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 
 CovarianceKind = Literal["poses", "increments"]
 

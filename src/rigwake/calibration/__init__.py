@@ -1,10 +1,10 @@
-"""The one result that everything downstream reads: rig, doubt, verdicts, provenance."""
+"""The one result that everything downstream reads: rig, uncertainty, verdicts, provenance."""
 
-from rigwake.calibration.values import (
+from rigwake.calibration.rig_calibration import (
     CalibratedCamera,
     Calibration,
     KnownOffset,
-    UndeterminedDirection,
+    UnobservableDirection,
 )
 from rigwake.calibration.yaml_file import load_calibration, save_calibration
 
@@ -12,7 +12,7 @@ __all__ = [
     "CalibratedCamera",
     "Calibration",
     "KnownOffset",
-    "UndeterminedDirection",
+    "UnobservableDirection",
     "load_calibration",
     "save_calibration",
 ]

@@ -11,12 +11,17 @@ import numpy as np
 import yaml
 
 from rigwake import __version__
+from rigwake._types import Array
 from rigwake.atomic import write_text_atomic
-from rigwake.calibration.values import CalibratedCamera, Calibration, KnownOffset, UndeterminedDirection
-from rigwake.cameras.catalogue import camera_from_dict, camera_to_dict
+from rigwake.calibration.rig_calibration import (
+    CalibratedCamera,
+    Calibration,
+    KnownOffset,
+    UnobservableDirection,
+)
+from rigwake.cameras.registry import camera_from_dict, camera_to_dict
 from rigwake.errors import InputError
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 
 SCHEMA_VERSION = 1
 _HEADER = f"""\
@@ -63,7 +68,7 @@ def _camera_to_dict(camera: CalibratedCamera) -> dict[str, Any]:
         "scale_std": camera.scale_std,
         "undetermined": [
             {"words": d.words, "remedy": d.remedy, "direction_rig_axes": d.direction}
-            for d in camera.undetermined
+            for d in camera.unobservable
         ],
         "known_offsets": [
             {"direction_rig_axes": k.direction_rig, "value_m": k.value_m, "std_m": k.std_m}
@@ -145,8 +150,8 @@ def _camera_from_dict(name: str, content: Mapping[str, Any], where: str) -> Cali
         name=name,
         rig_from_cam=rig_from_cam,
         covariance=np.full((6, 6), np.nan) if covariance is None else _floats(covariance, (6, 6), where),
-        undetermined=tuple(
-            UndeterminedDirection(
+        unobservable=tuple(
+            UnobservableDirection(
                 _floats(d["direction_rig_axes"], (6,), where), str(d["words"]), str(d.get("remedy", ""))
             )
             for d in content.get("undetermined") or ()

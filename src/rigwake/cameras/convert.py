@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.catalogue import camera_class
-from rigwake.cameras.lens import Lens, axis_focal_px
+from rigwake._types import Array
+from rigwake.cameras.models.lens import Lens, axis_focal_px
+from rigwake.cameras.protocol import CameraModel
+from rigwake.cameras.registry import camera_class
 from rigwake.errors import CameraError
-from rigwake.geometry.so3 import Array
 
 _SAMPLES_ALONG_WIDTH = 60
 _MAX_STEPS = 200

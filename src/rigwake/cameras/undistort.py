@@ -13,17 +13,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.cameras.base import CameraModel, Mask
-from rigwake.cameras.lens import axis_focal_px
-from rigwake.cameras.pinhole import Pinhole
+from rigwake._types import Array, Mask
+from rigwake.cameras.models.lens import axis_focal_px
+from rigwake.cameras.models.pinhole import Pinhole
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import CameraError
-from rigwake.geometry.so3 import Array
 
 _ONE_VIEW_ANGLE = np.deg2rad(50.0)  # one pinhole view reaches this far without wasting pixels at its rim
 _FIVE_FACES_ANGLE = np.arccos(-1 / np.sqrt(3))  # to the corners of a cube without its back face
 
 
-class View(Protocol):
+class ViewGeometry(Protocol):
     """What a remap table needs of its target."""
 
     @property
@@ -128,11 +128,11 @@ class RemapTable:
 class VirtualView:
     """A virtual camera and how it is turned: `ray_cam = cam_from_view @ ray_view`."""
 
-    view: View
+    view: ViewGeometry
     cam_from_view: Array
 
 
-def remap_table(camera: CameraModel, view: View, cam_from_view: Array | None = None) -> RemapTable:
+def remap_table(camera: CameraModel, view: ViewGeometry, cam_from_view: Array | None = None) -> RemapTable:
     """The table that shows what `view`, turned by the rotation `cam_from_view` (3, 3), would see.
 
     Rays outside the lens's maximal angle and pixels outside the image are masked, never guessed.

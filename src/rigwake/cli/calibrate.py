@@ -9,12 +9,12 @@ import typer
 import yaml
 from rich.markup import escape
 
-from rigwake.cli.console import figures_table, next_step, out, print_title, share_bars, write_json
+from rigwake.cli.console import figures_table, next_step, out, print_title, progress_bars, write_json
 from rigwake.cli.options import JsonOption, TopicOption, TopicsOption
 
 if TYPE_CHECKING:
     from rigwake.calibration import Calibration
-    from rigwake.pipeline.calibrate import CalibrationRun
+    from rigwake.pipeline.calibration_run import CalibrationRun
 
 _OPEN = "undetermined"
 
@@ -42,7 +42,7 @@ def command(
         bool, typer.Option("--resume", help="Keep the stages that a former run finished.")
     ] = False,
     jobs: Annotated[int | None, typer.Option(help="Processes (default: one per core).")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of everything random.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Random seed.")] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file of settings.")] = None,
     assignments: Annotated[
         list[str] | None, typer.Option("--set", help="One setting: adjustment.cross_camera=false.")
@@ -64,7 +64,7 @@ def command(
     from rigwake.calibration.yaml_file import calibration_to_dict
     from rigwake.config import load_config
     from rigwake.errors import UsageError
-    from rigwake.pipeline.calibrate import calibrate
+    from rigwake.pipeline.calibration_run import calibrate
     from rigwake.pipeline.prior import load_prior
     from rigwake.readers.topics import TopicMap
 
@@ -83,7 +83,7 @@ def command(
         return
     if recording is None:
         raise UsageError("No recording was given.", remedy="rigwake calibrate RECORDING -o OUT")
-    with share_bars() as bars:
+    with progress_bars() as bars:
         run = calibrate(
             recording,
             out_folder,
@@ -124,11 +124,11 @@ def _millimetres(value_m: float, std_m: float) -> str:
 
 def print_calibration(calibration: Calibration) -> None:
     """The rig as a table: position with sigmas, sigma of the rotation, clock, repeatability."""
-    headings = ("camera", "x mm", "y mm", "z mm", "± deg", "clock ms", "halves")
+    headings = ("camera", "x mm", "y mm", "z mm", "± deg", "offset ms", "halves")
     table = figures_table(headings)
     halves = calibration.checks.get("split_half", {})
     for name, camera in calibration.cameras.items():
-        known = camera.determined_axes
+        known = camera.observable_axes
         cells = [
             _millimetres(x, s) if ok else _OPEN
             for x, s, ok in zip(
@@ -136,15 +136,13 @@ def print_calibration(calibration: Calibration) -> None:
             )
         ]
         rotation = f"{camera.std_rotation_deg.max():.3f}" if known[:3].all() else _OPEN
-        clock = "–" if camera.time_offset_s is None else f"{1e3 * camera.time_offset_s:+.2f}"
+        time_offset = "–" if camera.time_offset_s is None else f"{1e3 * camera.time_offset_s:+.2f}"
         apart = halves.get(name, {}).get("sigmas") if isinstance(halves, dict) else None
-        table.add_row(escape(name), *cells, rotation, clock, "–" if apart is None else f"{apart:.1f}")
+        table.add_row(escape(name), *cells, rotation, time_offset, "–" if apart is None else f"{apart:.1f}")
     print_title(f"cameras in {calibration.reference}, ± one sigma")
     out.print(table)
     if halves:
         out.print("[dim]deg: rotation, worst axis; halves: difference of both halves in sigmas[/dim]")
     for camera in calibration.cameras.values():
-        for direction in camera.undetermined:
-            out.print(
-                f"[yellow]not determined:[/yellow] {escape(direction.words)}. {escape(direction.remedy)}"
-            )
+        for direction in camera.unobservable:
+            out.print(f"[yellow]unobservable:[/yellow] {escape(direction.words)}. {escape(direction.remedy)}")

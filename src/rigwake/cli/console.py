@@ -77,22 +77,22 @@ def progress_bar() -> Progress:
     )
 
 
-class ShareBars:
-    """One bar per name, told by `bars(name, what, share)`."""
+class ProgressBars:
+    """One bar per name, told by `bars(name, what, fraction)`."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
         self._tasks: dict[str, TaskID] = {}
 
-    def __call__(self, name: str, what: str, share: float) -> None:
-        """Show that `name` has done this share of `what`."""
+    def __call__(self, name: str, what: str, fraction: float) -> None:
+        """Show that `name` has done this fraction of `what`."""
         if name not in self._tasks:
             self._tasks[name] = self._progress.add_task(name, total=1.0)
-        self._progress.update(self._tasks[name], description=escape(f"{name}: {what}"), completed=share)
+        self._progress.update(self._tasks[name], description=escape(f"{name}: {what}"), completed=fraction)
 
 
 @contextmanager
-def share_bars() -> Iterator[ShareBars]:
+def progress_bars() -> Iterator[ProgressBars]:
     """Bars of things done at the same time, on stderr, gone when done."""
     columns = (
         SpinnerColumn(),
@@ -101,4 +101,4 @@ def share_bars() -> Iterator[ShareBars]:
         TextColumn("{task.percentage:.0f} %"),
     )
     with Progress(*columns, console=err, transient=True) as progress:
-        yield ShareBars(progress)
+        yield ProgressBars(progress)

@@ -14,7 +14,7 @@ from rigwake.cli.console import figures_table, next_step, out, print_title, writ
 from rigwake.cli.options import JsonOption
 
 if TYPE_CHECKING:
-    from rigwake.evaluate.calibrations import CameraDifference
+    from rigwake.evaluation.rig_errors import CameraDifference
 
 
 def command(
@@ -30,7 +30,7 @@ def command(
     Example: [cyan]rigwake diff june.yaml july.yaml --range 10 --range 100[/cyan]
     """
     from rigwake.calibration.yaml_file import plain
-    from rigwake.evaluate.calibrations import compare_calibrations
+    from rigwake.evaluation.rig_errors import compare_calibrations
     from rigwake.exporters import in_common_frame, read_calibration
 
     ranges = range_m or [5.0, 20.0, 100.0]

@@ -14,7 +14,7 @@ from rigwake.cli.console import figures_table, next_step, out, print_title, writ
 from rigwake.cli.options import JsonOption, require
 
 if TYPE_CHECKING:
-    from rigwake.evaluate.calibrations import RigErrors
+    from rigwake.evaluation.rig_errors import RigErrors
 
 
 def command(
@@ -34,9 +34,9 @@ def command(
 
     Example: [cyan]rigwake evaluate OUT/calibration.yaml --truth truth.yaml --json errors.json[/cyan]
     """
-    from rigwake.evaluate.calibrations import evaluate_calibration
+    from rigwake.evaluation.rig_errors import evaluate_calibration
     from rigwake.exporters import UNNAMED_FRAMES, read_calibration
-    from rigwake.readers.truth import read_true_rig, rig_in_frame
+    from rigwake.readers.truth_files import read_true_rig, rig_in_frame
 
     require("--gauge", gauge, ("reference", "align"))
     found = read_calibration(calibration)
@@ -58,7 +58,7 @@ def command(
 
 def _print(errors: RigErrors, title: str) -> None:
     """Errors per camera, and the worst pair of cameras."""
-    headings = ("camera", "rotation °", "x mm", "y mm", "z mm", "norm mm", "NEES (axes)", "clock ms")
+    headings = ("camera", "rotation °", "x mm", "y mm", "z mm", "norm mm", "NEES (axes)", "offset ms")
     table = figures_table(headings)
     for name, e in errors.cameras.items():
         offset = "–" if e.time_offset_error_s is None else f"{1e3 * e.time_offset_error_s:+.2f}"

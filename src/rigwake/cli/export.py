@@ -38,7 +38,7 @@ def command(
     max_fit_error: Annotated[
         float, typer.Option(help="Largest error, in pixels, of a lens that has to be converted.")
     ] = 0.5,
-    allow_undetermined: Annotated[
+    allow_unobservable: Annotated[
         bool,
         typer.Option(
             "--allow-undetermined",
@@ -59,7 +59,7 @@ def command(
         parent_frame, child_frame, None if imu is None else read_imu_noise(imu), max_fit_error
     )
     notes = export_calibration(
-        read_calibration(calibration), to, target, options, allow_undetermined=allow_undetermined
+        read_calibration(calibration), to, target, options, allow_unobservable=allow_unobservable
     )
     out.print(f"{target}: {FORMATS[to].what}", markup=False, highlight=False)
     for note in notes:

@@ -14,7 +14,7 @@ from rigwake.cli.options import JsonOption, require
 
 if TYPE_CHECKING:
     from rigwake.calibration import CalibratedCamera
-    from rigwake.handeye.values import HandeyeResult
+    from rigwake.handeye.handeye_result import HandeyeResult
     from rigwake.trajectory import Trajectory
 
 
@@ -48,15 +48,15 @@ def command(
     Example: [cyan]rigwake handeye imu.tum port.tum starboard.tum -o calibration.yaml[/cyan]
     """
     from rigwake.calibration import save_calibration
-    from rigwake.handeye.calibrate import calibrate_handeye
-    from rigwake.handeye.values import HandeyeOptions
+    from rigwake.handeye.handeye_result import HandeyeOptions
+    from rigwake.handeye.joint_calibration import calibrate_handeye
 
-    require("--method", method, ("ml", "seed"))
+    require("--method", method, ("ml", "thesis", "seed"))
     require("--noise", noise, ("auto", "estimated", "increments", "poses"))
     inputs = [_Input.parse(text) for text in (reference, *others)]
     trajectories = [_read(one) for one in inputs]
     options = HandeyeOptions(
-        method="seed" if method == "seed" else "ml",
+        method="thesis" if method in ("thesis", "seed") else "ml",
         noise=None if noise == "auto" else noise,  # type: ignore[arg-type]
         time_offset=time_offset,
         scale=scale,
@@ -151,7 +151,7 @@ def _member_to_json(result: HandeyeResult, camera: CalibratedCamera) -> dict[str
         "segment_scales": [_plain(pair) for pair in result.scales[camera.name]],
         "unobservable": [
             {"direction": _plain(d.direction), "words": d.words, "remedy": d.remedy}
-            for d in camera.undetermined
+            for d in camera.unobservable
         ],
         "known_offsets": [
             {"direction": _plain(k.direction_rig), "value_m": k.value_m, "std_m": k.std_m}
@@ -172,7 +172,7 @@ def _print(result: HandeyeResult) -> None:
         ("member", "axis", "rotation °", "offset mm"),
         words=2,
     )
-    others = figures_table(("member", "clock ms", "scale"))
+    others = figures_table(("member", "offset ms", "scale"))
     for name, camera in result.members.items():
         turn = _rotation_vector_deg(camera)
         offset, offset_std = 1e3 * camera.rig_from_cam.translation, 1e3 * camera.std_translation_m
@@ -183,9 +183,9 @@ def _print(result: HandeyeResult) -> None:
                 _figure(turn[i], camera.std_rotation_deg[i], 4),
                 _figure(offset[i], offset_std[i], 1),
             )
-        clock = None if camera.time_offset_s is None else 1e3 * camera.time_offset_s
-        clock_std = None if camera.time_offset_std_s is None else 1e3 * camera.time_offset_std_s
-        figures = _figure(clock, clock_std, 3), _figure(camera.scale, camera.scale_std, 4)
+        time_offset = None if camera.time_offset_s is None else 1e3 * camera.time_offset_s
+        time_offset_std = None if camera.time_offset_std_s is None else 1e3 * camera.time_offset_std_s
+        figures = _figure(time_offset, time_offset_std, 3), _figure(camera.scale, camera.scale_std, 4)
         if figures != ("–", "–"):
             others.add_row(escape(name), *figures)
     print_title(f"mountings in {result.reference}: rotation vector and offset, ± one sigma")
@@ -194,12 +194,12 @@ def _print(result: HandeyeResult) -> None:
         out.print(others)
     out.print(f"noise: {result.noise}; {result.steps} steps, {result.down_weighted} down-weighted")
     for camera in result.members.values():
-        for d in camera.undetermined:
-            out.print(f"[yellow]not determined: {escape(d.words)}.[/yellow] {escape(d.remedy)}")
+        for d in camera.unobservable:
+            out.print(f"[yellow]unobservable: {escape(d.words)}.[/yellow] {escape(d.remedy)}")
 
 
 def _rotation_vector_deg(camera: CalibratedCamera) -> Any:
-    """(3,) degrees; NaN where the rotation is not determined."""
+    """(3,) degrees; NaN where the rotation is unobservable."""
     import numpy as np
 
     from rigwake.geometry import so3

@@ -12,11 +12,11 @@ from rich.table import Table
 from rigwake.atomic import write_text_atomic
 from rigwake.cli.console import figures_table, next_step, out, progress_bar, write_json
 from rigwake.cli.options import JsonOption, TopicOption, TopicsOption
-from rigwake.inspection.clocks import ClockOffset
-from rigwake.inspection.inspect import Inspection, inspect_recording
-from rigwake.inspection.page import inspection_page
-from rigwake.inspection.summary import inspection_to_dict
-from rigwake.inspection.verdict import Verdict, judge
+from rigwake.inspection.inspection_page import inspection_page
+from rigwake.inspection.inspection_summary import inspection_to_dict
+from rigwake.inspection.readiness import Readiness, judge
+from rigwake.inspection.recording_inspection import Inspection, inspect_recording
+from rigwake.inspection.time_offsets import TimeOffset
 from rigwake.readers.open import open_recording
 from rigwake.readers.topics import TopicMap
 
@@ -59,7 +59,7 @@ def command(
             next_step(f"rigwake calibrate {recording} -o OUT", "estimate the rig")
 
 
-def _print(inspection: Inspection, verdict: Verdict) -> None:
+def _print(inspection: Inspection, verdict: Readiness) -> None:
     recording = inspection.recording
     out.print(f"[bold]{escape(recording.path.name)}[/bold]  {recording.kind}")
     out.print(_sensor_table(inspection))
@@ -92,17 +92,17 @@ def _sensor_table(inspection: Inspection) -> Table:
             f"{t.rate_hz:.2f}",
             f"{t.jitter_ms:.2f}",
             str(t.dropped),
-            _clock_words(inspection.clocks.get(key)),
+            _time_offset_text(inspection.time_offsets.get(key)),
         )
     return table
 
 
-def _clock_words(clock: ClockOffset | None) -> str:
-    if clock is None:
+def _time_offset_text(time_offset: TimeOffset | None) -> str:
+    if time_offset is None:
         return ""
-    if clock.offset_s is None or clock.std_s is None:
+    if time_offset.offset_s is None or time_offset.std_s is None:
         return "[dim]cannot tell[/dim]"
-    return f"{1e3 * clock.offset_s:+.0f} ± {1e3 * clock.std_s:.0f} ms"
+    return f"{1e3 * time_offset.offset_s:+.0f} ± {1e3 * time_offset.std_s:.0f} ms"
 
 
 def _what(inspection: Inspection, key: str) -> str:

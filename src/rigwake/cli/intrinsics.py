@@ -14,8 +14,8 @@ from rigwake.cli.options import JsonOption
 from rigwake.errors import UsageError
 
 if TYPE_CHECKING:
-    from rigwake.intrinsics.calibrate import IntrinsicCalibration
-    from rigwake.intrinsics.observations import BoardObservations
+    from rigwake.intrinsics.board_calibration import IntrinsicCalibration
+    from rigwake.intrinsics.board_observations import BoardObservations
     from rigwake.intrinsics.select import ModelScore
 
 
@@ -50,7 +50,7 @@ def command(
 
     Example: [cyan]rigwake intrinsics images/ --board aprilgrid:6x6:0.088:0.3 --model kb4 -o front.yaml[/cyan]
     """
-    from rigwake.intrinsics.calibrate import calibrate
+    from rigwake.intrinsics.board_calibration import calibrate
     from rigwake.intrinsics.plots import save_plots
     from rigwake.intrinsics.result_file import calibration_to_dict, save_intrinsics
     from rigwake.intrinsics.select import choose
@@ -87,9 +87,9 @@ def _names(text: str) -> list[str]:
 
 
 def _observe(images: list[Path], board: str | None, image_size: str | None) -> BoardObservations:
+    from rigwake.intrinsics.board_observations import read_corner_file
     from rigwake.intrinsics.boards import parse_board
     from rigwake.intrinsics.detect import detect_board, list_images
-    from rigwake.intrinsics.observations import read_corner_file
 
     if any(path.name.endswith((".csv", ".csv.gz")) for path in images):
         if len(images) > 1:
@@ -138,10 +138,10 @@ def _print(result: IntrinsicCalibration, observations: BoardObservations, scores
     size = f"{result.camera.width_px} x {result.camera.height_px} px"
     table = figures_table(("parameter", "value", "± 1 sigma"))
     for (parameter, std), value in zip(result.stds.items(), result.camera.params.tolist(), strict=True):
-        doubt = (
-            "held" if parameter in result.fixed else f"{std:.3g}" if np.isfinite(std) else "not determined"
+        uncertainty = (
+            "held" if parameter in result.fixed else f"{std:.3g}" if np.isfinite(std) else "unobservable"
         )
-        table.add_row(parameter, f"{value:.8g}" if np.isfinite(std) else "–", doubt)
+        table.add_row(parameter, f"{value:.8g}" if np.isfinite(std) else "–", uncertainty)
     print_title(f"{result.camera.model}, {size}")
     out.print(table)
     out.print(
@@ -151,7 +151,7 @@ def _print(result: IntrinsicCalibration, observations: BoardObservations, scores
     )
     for view, reason in (*result.dropped_views, *observations.unused):
         out.print(f"left out: {view}: {reason}", highlight=False)
-    if result.undetermined:
-        out.print(f"[yellow]not determined by these views: {', '.join(result.undetermined)}[/yellow]")
+    if result.unobservable:
+        out.print(f"[yellow]unobservable by these views: {', '.join(result.unobservable)}[/yellow]")
     if not result.converged:
         out.print("[yellow]the refinement had not converged: add views or fix parameters[/yellow]")

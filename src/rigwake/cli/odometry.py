@@ -17,7 +17,7 @@ from rigwake.cli.options import JsonOption, TopicOption, TopicsOption, require
 from rigwake.errors import RigwakeError
 
 if TYPE_CHECKING:
-    from rigwake.odometry.camera import CameraOdometry, CameraOdometryOptions
+    from rigwake.odometry.camera_odometry import CameraOdometry, CameraOdometryOptions
     from rigwake.recording import AttitudeStream, CameraStream, GnssStream, ImuStream, Recording
 
 
@@ -54,7 +54,7 @@ def command(
         ),
     ] = True,
     mask: Annotated[Path | None, typer.Option(help="Picture, white where the camera may be used.")] = None,
-    seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     topic: TopicOption = (),
     topics: TopicsOption = None,
     json_file: JsonOption = None,
@@ -63,12 +63,12 @@ def command(
 
     Example: [cyan]rigwake odometry harbour.bag --camera front -o OUT[/cyan]
     """
-    from rigwake.odometry.camera import CameraOdometryOptions, Method
-    from rigwake.odometry.options import OdometryOptions
-    from rigwake.odometry.seed import SeedOptions
+    from rigwake.odometry.camera_odometry import CameraOdometryOptions, Method
+    from rigwake.odometry.odometry_options import OdometryOptions
+    from rigwake.odometry.thesis_odometry import ThesisOptions
     from rigwake.readers.open import open_recording
     from rigwake.readers.topics import TopicMap
-    from rigwake.tracking.options import FrontEndName, TrackingOptions
+    from rigwake.tracking.tracking_options import FrontEndName, TrackingOptions
 
     require("--front-end", front_end, get_args(FrontEndName))
     require("--method", method, get_args(Method))
@@ -77,7 +77,7 @@ def command(
         method=cast(Method, method),
         tracking=TrackingOptions(front_end=cast(FrontEndName, front_end)),
         odometry=OdometryOptions(seed=seed),
-        seed=SeedOptions(seed=seed),
+        seed=ThesisOptions(seed=seed),
         hull=hull,
         horizon=horizon,
         mask_file=mask,
@@ -185,7 +185,7 @@ def _in_process(
 def _attempt(
     stream: CameraStream, sensors: Sensors, options: CameraOdometryOptions, report: Report
 ) -> CameraOdometry | RigwakeError:
-    from rigwake.odometry.camera import run_camera
+    from rigwake.odometry.camera_odometry import run_camera
 
     try:
         return run_camera(stream, sensors.imu, sensors.gnss, options, report, sensors.attitude)
@@ -194,7 +194,7 @@ def _attempt(
 
 
 def _write(output: Path, name: str, result: CameraOdometry) -> None:
-    from rigwake.writers.trajectories import write_tum
+    from rigwake.writers.trajectory_writer import write_tum
 
     write_tum(result.trajectory, output / f"{name}.tum")
     result.tracks.save(output / f"tracks_{name}.npz")

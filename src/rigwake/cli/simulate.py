@@ -13,10 +13,10 @@ import yaml
 from rigwake.cli.console import next_step, out, progress_bar
 from rigwake.errors import UsageError
 from rigwake.recording import Finding, Recording
-from rigwake.simulate.record import build_world, render_recording, work_folder
-from rigwake.simulate.scenario import Scenario, build_scenario, load_scenario, preset_names
-from rigwake.simulate.setup import prepare
-from rigwake.simulate.truth import write_truth, write_truth_images
+from rigwake.simulation.record import build_world, render_recording, work_folder
+from rigwake.simulation.scenario import Scenario, build_scenario, load_scenario, preset_names
+from rigwake.simulation.setup import prepare
+from rigwake.simulation.truth_writer import write_truth, write_truth_images
 from rigwake.writers.write import write_recording
 
 

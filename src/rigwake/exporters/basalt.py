@@ -16,22 +16,22 @@ import numpy as np
 
 from rigwake.atomic import write_text_atomic
 from rigwake.calibration import Calibration
-from rigwake.cameras.formats import camera_from_basalt, camera_to_basalt
+from rigwake.cameras.formats.camera_dicts import camera_from_basalt, camera_to_basalt
 from rigwake.errors import InputError, UsageError
-from rigwake.exporters.base import (
+from rigwake.exporters.export_base import (
     IMU,
+    ExportedImuNoise,
     ExportOptions,
-    ImuNoise,
     Notes,
-    foreign_calibration,
-    foreign_camera,
+    external_calibration,
+    external_camera,
     read_json_file,
     require_lenses,
     require_reference,
     transform_from_parts,
 )
 from rigwake.exporters.lenses import write_lens
-from rigwake.readers.truth import read_yaml_mapping
+from rigwake.readers.truth_files import read_yaml_mapping
 
 _LENSES = ("kb4", "ds", "eucm", "rational")
 _OFFSETS_AGREE_S = 1e-3
@@ -79,7 +79,7 @@ def _pose(imu_from_cam: Any) -> dict[str, float]:
 
 
 def _common_offset(calibration: Calibration) -> tuple[float, Notes]:
-    """The one clock offset that Basalt knows; UsageError if the cameras' clocks differ."""
+    """The one time offset that Basalt knows; UsageError if the cameras' clocks differ."""
     known = [c.time_offset_s for c in calibration.cameras.values() if c.time_offset_s is not None]
     if not known:
         return 0.0, ["cam_time_offset_ns is 0: the clocks were not estimated"]
@@ -100,7 +100,7 @@ def read_basalt(path: Path) -> Calibration:
         poses, lenses, sizes = content["T_imu_cam"], content["intrinsics"], content["resolution"]
         offset_s = float(content.get("cam_time_offset_ns", 0)) * 1e-9
         cameras = [
-            foreign_camera(
+            external_camera(
                 f"cam{number}",
                 transform_from_parts(
                     [pose[k] for k in ("qw", "qx", "qy", "qz")],
@@ -114,7 +114,7 @@ def read_basalt(path: Path) -> Calibration:
         ]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path} is not a Basalt calibration: {type(error).__name__}: {error}.") from error
-    return foreign_calibration(IMU, cameras, path)
+    return external_calibration(IMU, cameras, path)
 
 
 _IMU_KEYS = {
@@ -126,13 +126,13 @@ _IMU_KEYS = {
 }
 
 
-def read_imu_noise(path: Path) -> ImuNoise:
+def read_imu_noise(path: Path) -> ExportedImuNoise:
     """Kalibr's imu.yaml, or the `imu0` of OpenVINS' kalibr_imu_chain.yaml."""
     content: Mapping[str, Any] = read_yaml_mapping(path)
     content = content.get("imu0", content)
     try:
         values = {ours: float(content[theirs]) for ours, theirs in _IMU_KEYS.items()}
-        return ImuNoise(**values, topic=str(content.get("rostopic", "")))
+        return ExportedImuNoise(**values, topic=str(content.get("rostopic", "")))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path} is not an imu.yaml: {type(error).__name__}: {error}.",

@@ -9,16 +9,16 @@ from __future__ import annotations
 from pathlib import Path
 
 from rigwake.calibration import Calibration
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.opencv_yaml import camera_from_camodocal, camera_to_camodocal
+from rigwake.cameras.formats.opencv_yaml import camera_from_camodocal, camera_to_camodocal
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import InputError
-from rigwake.exporters.base import (
+from rigwake.exporters.export_base import (
     ODOMETRY,
     ExportOptions,
     Notes,
+    external_calibration,
+    external_camera,
     file_stem,
-    foreign_calibration,
-    foreign_camera,
     read_text,
     read_yaml_file,
     transform_from_matrix,
@@ -65,9 +65,9 @@ def read_camodocal(path: Path) -> Calibration:
         if any(len(row) != 4 for row in matrix):
             raise InputError(f"{path}: {name}: a row must hold four numbers.")
         cameras.append(
-            foreign_camera(name, transform_from_matrix(matrix, f"{path}: {name}"), _lens(path.parent, name))
+            external_camera(name, transform_from_matrix(matrix, f"{path}: {name}"), _lens(path.parent, name))
         )
-    return foreign_calibration(ODOMETRY, cameras, path)
+    return external_calibration(ODOMETRY, cameras, path)
 
 
 def _file_name(camera: str) -> str:

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from rigwake.calibration import CalibratedCamera, Calibration
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.formats import camera_from_colmap, camera_to_colmap
+from rigwake.cameras.formats.camera_dicts import camera_from_colmap, camera_to_colmap
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import InputError
-from rigwake.exporters.base import (
+from rigwake.exporters.export_base import (
     ExportOptions,
     Notes,
-    foreign_calibration,
-    foreign_camera,
+    external_calibration,
+    external_camera,
     header,
     read_json_file,
     read_text,
@@ -89,7 +89,7 @@ def read_colmap(path: Path) -> Calibration:
         raise InputError(f"{path} is not a rig config of COLMAP: {type(error).__name__}: {error}.") from error
     if len(references) != 1:
         raise InputError(f"{path}: {len(references)} reference sensors, exactly one is needed.")
-    return foreign_calibration(references[0], cameras, path)
+    return external_calibration(references[0], cameras, path)
 
 
 def _camera(entry: Any, size: tuple[int, int] | None, path: Path) -> CalibratedCamera:
@@ -103,7 +103,7 @@ def _camera(entry: Any, size: tuple[int, int] | None, path: Path) -> CalibratedC
     model: CameraModel | None = None
     if size is not None and "camera_model_name" in entry:
         model = camera_from_colmap(str(entry["camera_model_name"]), entry["camera_params"], *size)
-    return foreign_camera(name, rig_from_cam, model)
+    return external_camera(name, rig_from_cam, model)
 
 
 def _image_sizes(path: Path) -> list[tuple[int, int]]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from rigwake.calibration import Calibration
 from rigwake.errors import InputError
-from rigwake.exporters.base import UNNAMED_FRAMES, Notes, refer_to_camera
+from rigwake.exporters.export_base import UNNAMED_FRAMES, Notes, refer_to_camera
 
 
 def in_common_frame(a: Calibration, b: Calibration) -> tuple[Calibration, Calibration, Notes]:

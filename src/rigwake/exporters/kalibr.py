@@ -14,15 +14,15 @@ from typing import Any
 
 from rigwake.atomic import write_text_atomic
 from rigwake.calibration import CalibratedCamera, Calibration
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.formats import camera_from_kalibr, camera_to_kalibr
+from rigwake.cameras.formats.camera_dicts import camera_from_kalibr, camera_to_kalibr
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import CameraError, InputError
-from rigwake.exporters.base import (
+from rigwake.exporters.export_base import (
     IMU,
     ExportOptions,
     Notes,
-    foreign_calibration,
-    foreign_camera,
+    external_calibration,
+    external_camera,
     header,
     read_yaml_file,
     require_lenses,
@@ -115,7 +115,7 @@ def read_kalibr(path: Path) -> Calibration:
         rig_from_cam = _rig_from_cam(entry, cameras[-1] if cameras else None, all(to_imu), f"{path}: {key}")
         shift = entry.get("timeshift_cam_imu")
         cameras.append(
-            foreign_camera(
+            external_camera(
                 name,
                 rig_from_cam,
                 camera_from_kalibr(entry) if "intrinsics" in entry else None,
@@ -123,7 +123,7 @@ def read_kalibr(path: Path) -> Calibration:
                 str(entry.get("rostopic", "")),
             )
         )
-    return foreign_calibration(IMU if any(to_imu) else names[0] if names else "", cameras, path)
+    return external_calibration(IMU if any(to_imu) else names[0] if names else "", cameras, path)
 
 
 def _names(keys: list[Any], entries: list[Mapping[str, Any]]) -> list[str]:

@@ -7,10 +7,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from rigwake.cameras.base import CameraModel
 from rigwake.cameras.convert import Conversion, convert_camera
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import CameraError
-from rigwake.exporters.base import Notes
+from rigwake.exporters.export_base import Notes
 
 Written = TypeVar("Written")
 

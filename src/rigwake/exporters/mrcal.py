@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 
 from rigwake.calibration import CalibratedCamera, Calibration
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.catalogue import camera_from_params
+from rigwake.cameras.protocol import CameraModel
+from rigwake.cameras.registry import camera_from_params
 from rigwake.errors import CameraError, InputError
-from rigwake.exporters.base import (
+from rigwake.exporters.export_base import (
     REF,
     ExportOptions,
     Notes,
+    external_calibration,
+    external_camera,
     file_stem,
-    foreign_calibration,
-    foreign_camera,
     header,
     read_text,
     require_lenses,
@@ -85,7 +85,7 @@ def write_mrcal(calibration: Calibration, path: Path, options: ExportOptions, no
 def read_mrcal(path: Path) -> Calibration:
     """One camera model, or all of a folder; other lenses than OpenCV's keep their place but not their lens."""
     files = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
-    return foreign_calibration(REF, [_camera(file) for file in files], path)
+    return external_calibration(REF, [_camera(file) for file in files], path)
 
 
 def _camera(file: Path) -> CalibratedCamera:
@@ -95,7 +95,7 @@ def _camera(file: Path) -> CalibratedCamera:
         model = _camera_model(str(content["lensmodel"]), content["intrinsics"], content["imagersize"])
     except (SyntaxError, ValueError, KeyError, TypeError, MemoryError, RecursionError) as error:
         raise InputError(f"{file} is not a cameramodel: {type(error).__name__}: {error}.") from error
-    return foreign_camera(file.stem, SE3(so3.exp(rt[:3]), rt[3:]).inverse(), model)
+    return external_camera(file.stem, SE3(so3.exp(rt[:3]), rt[3:]).inverse(), model)
 
 
 def _six(values: Sequence[float]) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -9,15 +9,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from rigwake._types import Array
 from rigwake.calibration import CalibratedCamera, Calibration
-from rigwake.cameras.opencv_yaml import camera_from_opencv, camera_to_opencv
+from rigwake.cameras.formats.opencv_yaml import camera_from_opencv, camera_to_opencv
 from rigwake.errors import InputError
-from rigwake.exporters.base import (
+from rigwake.exporters.export_base import (
     ExportOptions,
     Notes,
+    external_calibration,
+    external_camera,
     file_stem,
-    foreign_calibration,
-    foreign_camera,
     header,
     read_yaml_file,
     require_lenses,
@@ -25,7 +26,6 @@ from rigwake.exporters.base import (
     write_files,
 )
 from rigwake.exporters.lenses import write_lens
-from rigwake.geometry.so3 import Array
 
 _LENSES = ("kb4", "rational", "pinhole")
 _MARK = "rig_from_cam"
@@ -89,7 +89,7 @@ def read_opencv(path: Path) -> Calibration:
             raise InputError(f"{file}: {_MARK} is no matrix: {type(error).__name__}: {error}.") from error
         frames.add(str(content.get("rig_frame", "rig")))
         cameras.append(
-            foreign_camera(
+            external_camera(
                 str(content.get("camera_name", file.stem)),
                 transform_from_matrix(rows, str(file)),
                 camera_from_opencv(content),
@@ -99,4 +99,4 @@ def read_opencv(path: Path) -> Calibration:
         )
     if len(frames) > 1:
         raise InputError(f"{path}: the cameras refer to different frames: {', '.join(sorted(frames))}.")
-    return foreign_calibration(next(iter(frames), "rig"), cameras, path)
+    return external_calibration(next(iter(frames), "rig"), cameras, path)

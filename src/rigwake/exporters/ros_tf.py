@@ -20,11 +20,11 @@ from xml.sax.saxutils import quoteattr
 from rigwake.atomic import write_text_atomic
 from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.errors import InputError, UsageError
-from rigwake.exporters.base import (
+from rigwake.exporters.export_base import (
     ExportOptions,
     Notes,
-    foreign_calibration,
-    foreign_camera,
+    external_calibration,
+    external_camera,
     header,
     read_text,
     transform_from_parts,
@@ -144,7 +144,7 @@ def calibration_of_frames(edges: Edges, path: Path) -> Calibration:
         raise InputError(f"{path}: the frames have {len(roots)} roots ({', '.join(sorted(roots))}), not one.")
     optical = [frame for frame in parents if re.search(r"_optical(_frame)?$", frame)]
     cameras = [_camera(frame, parents) for frame in optical or parents]
-    return foreign_calibration(roots.pop(), cameras, path)
+    return external_calibration(roots.pop(), cameras, path)
 
 
 def _camera(frame: str, parents: dict[str, tuple[str, SE3]]) -> CalibratedCamera:
@@ -154,7 +154,7 @@ def _camera(frame: str, parents: dict[str, tuple[str, SE3]]) -> CalibratedCamera
             break
         at, transform = parents[at]
         root_from_cam = transform * root_from_cam
-    return foreign_camera(re.sub(r"_optical(_frame)?$", "", frame), root_from_cam)
+    return external_camera(re.sub(r"_optical(_frame)?$", "", frame), root_from_cam)
 
 
 def _edge(words: list[str], where: str) -> tuple[tuple[str, str], SE3]:

@@ -16,7 +16,7 @@ import numpy as np
 from rigwake.atomic import write_text_atomic
 from rigwake.calibration import Calibration
 from rigwake.errors import InputError
-from rigwake.exporters.base import ExportOptions, Notes, header, read_text
+from rigwake.exporters.export_base import ExportOptions, Notes, header, read_text
 from rigwake.exporters.ros_tf import Edges, calibration_of_frames, camera_frames
 from rigwake.geometry.euler import rotation_from_yaw_pitch_roll, yaw_pitch_roll
 from rigwake.geometry.se3 import SE3

@@ -11,9 +11,9 @@ from typing import Literal
 
 import numpy as np
 
+from rigwake._types import Array
 from rigwake.errors import EstimationError
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 
 AlignmentKind = Literal["se3", "sim3", "yaw"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array
 
 
 def yaw_pitch_roll(rotation: ArrayLike) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pyproj import Transformer
 
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array
 
 Lla = tuple[float, float, float]
 

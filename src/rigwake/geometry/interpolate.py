@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from rigwake._types import Array, Stamps
 from rigwake.errors import InputError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
-
-Stamps = NDArray[np.int64]
 
 
 def interpolate(timestamps_ns: Stamps, world_from_body: SE3, at_ns: Stamps) -> SE3:

@@ -10,13 +10,11 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
+from rigwake._types import Array, Mask
 from rigwake.errors import EstimationError
 from rigwake.geometry import so3
 from rigwake.geometry.ransac import Budget, search
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

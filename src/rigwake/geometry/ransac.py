@@ -9,11 +9,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._types import Array, Mask
 from rigwake.errors import EstimationError
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
-
-Mask = NDArray[np.bool_]
 
 
 class PoseProblem(Protocol):
@@ -56,8 +54,8 @@ class Found:
     trials: int
 
 
-def _needed_trials(inlier_share: float, sample_size: int, budget: Budget) -> int:
-    good_sample = inlier_share**sample_size
+def _needed_trials(inlier_fraction: float, sample_size: int, budget: Budget) -> int:
+    good_sample = inlier_fraction**sample_size
     if good_sample >= 1 - 1e-12:
         return budget.min_trials
     if good_sample <= 1e-12:

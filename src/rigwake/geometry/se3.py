@@ -15,8 +15,8 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigwake._types import Array
 from rigwake.geometry import so3
-from rigwake.geometry.so3 import Array
 
 
 @dataclass(frozen=True, eq=False)

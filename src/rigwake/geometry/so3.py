@@ -7,9 +7,10 @@ Source: Barfoot, *State Estimation for Robotics* (2017), chapter 7; Sola et al.,
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from rigwake._types import Array
+
 _SMALL = 1e-4  # below this angle the closed forms lose digits, and three Taylor terms are exact to 1e-24
 
 

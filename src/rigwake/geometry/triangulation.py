@@ -12,10 +12,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._types import Array, Indices
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
-
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,16 +12,13 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 import poselib
-from numpy.typing import NDArray
 
+from rigwake._types import Array, Indices, Mask
 from rigwake.errors import EstimationError
 from rigwake.geometry import so3
 from rigwake.geometry.ransac import Budget, search
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 
-Mask = NDArray[np.bool_]
-Indices = NDArray[np.int64]
 SOLVERS = ("five-point", "eight-point")
 
 

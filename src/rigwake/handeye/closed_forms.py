@@ -10,9 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from rigwake._types import Array
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 
 
 def park_martin(A: SE3, B: SE3) -> SE3:

@@ -1,4 +1,4 @@
-"""The normal equations of all unknowns, and how much of their information the noise only feigns."""
+"""The normal equations of all unknowns, and how much of their information the noise only adds spuriously."""
 
 from __future__ import annotations
 
@@ -8,14 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array
 from rigwake.handeye import normal_kernels
-from rigwake.handeye.motions import Layout, Linearised, Mounting, Steps, feigned_information, linearise
+from rigwake.handeye.handeye_problem import HandeyeProblem
+from rigwake.handeye.motions import (
+    Linearised,
+    Mounting,
+    MountingLayout,
+    Steps,
+    linearise,
+    spurious_information,
+)
 from rigwake.handeye.noise import Jitter, StepNoise, outlier_limit
-from rigwake.handeye.problem import HandeyeProblem
 
 # an unknown is as good as open when its standard deviation exceeds this: 5 degrees, 1 m, 0.1 s, a factor e
-USEFUL_ROTATION, USEFUL_TRANSLATION, USEFUL_CLOCK, USEFUL_LOG_SCALE = np.deg2rad(5.0), 1.0, 0.1, 1.0
+USEFUL_ROTATION, USEFUL_TRANSLATION, USEFUL_TIME_OFFSET, USEFUL_LOG_SCALE = np.deg2rad(5.0), 1.0, 0.1, 1.0
 _ROUNDING = 1e-13  # an eigenvalue this small, beside a unit diagonal, is zero
 
 
@@ -24,14 +31,14 @@ class Equations:
     """Of all P unknowns over N steps.
 
     information: (P, P) `J^T W J`. scores: (N, P) gradients per step. weights: (N,) robust. used: (N,) steps
-    that entered. feigned: (P, P) what the noise alone contributes to `information`.
+    that entered. spurious: (P, P) what the noise alone contributes to `information`.
     """
 
     information: Array
     scores: Array
     weights: Array
     used: NDArray[np.bool_]
-    feigned: Array
+    spurious: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +63,11 @@ def group_steps(valid: NDArray[np.bool_]) -> list[Group]:
 
 @dataclass(frozen=True, eq=False)
 class _Weighing:
-    """The noise of a group's steps, each (1 or n, 6 m, 6 m). inverse: S^-1; blame: Sa S^-1, the share of a
+    """The noise of a group's steps, each (1 or n, 6 m, 6 m). inverse: S^-1; blame: Sa S^-1, the fraction of a
     residual that is the reference's; left: covariance of the reference's error once that estimate is taken off."""
 
     inverse: Array
-    blame: Array
+    gain: Array
     left: Array
 
 
@@ -88,8 +95,8 @@ def form_equations(
     reference_errors, weighted = np.zeros_like(stacked), []
     for group, w in zip(groups, weighings, strict=True):
         limit = outlier_limit(len(group.rows)) if robust else np.inf
-        shares = (w.inverse, w.blame, limit, weights, reference_errors)
-        weighted.append(normal_kernels.weigh(stacked, filtered, group.steps, group.rows, *shares))
+        fractions = (w.inverse, w.gain, limit, weights, reference_errors)
+        weighted.append(normal_kernels.weigh(stacked, filtered, group.steps, group.rows, *fractions))
         used[group.steps] = True
     linear = [
         linearise(s, x, layout, reference_errors[:, 6 * m : 6 * m + 6])
@@ -100,8 +107,8 @@ def form_equations(
     information, scores = np.zeros((size, size)), np.zeros((len(stacked), size))
     for group, w, errors in zip(groups, weighings, weighted, strict=True):
         _add(information, scores, group, w.inverse, errors, weights, jacobians, problem.columns)
-    feigned = _feigned(problem, steps, linear, groups, weighings)
-    return Equations(information, scores, weights, used, feigned)
+    spurious = _spurious(problem, steps, linear, groups, weighings)
+    return Equations(information, scores, weights, used, spurious)
 
 
 def _side_by_side(parts: Sequence[Array]) -> Array:
@@ -134,7 +141,7 @@ def _add(
             )
 
 
-def _feigned(
+def _spurious(
     problem: HandeyeProblem,
     steps: Sequence[Steps],
     linear: Sequence[Linearised],
@@ -146,23 +153,23 @@ def _feigned(
     for group, w in zip(groups, weighings, strict=True):
         for i, m in enumerate(group.members):
             mine, layout = slice(6 * i, 6 * i + 6), problem.layouts[m]
-            total[columns[m], columns[m]] += feigned_information(
+            total[columns[m], columns[m]] += spurious_information(
                 steps[m], linear[m], layout, group.steps, w.left[:, mine, mine], w.inverse[:, mine, mine]
             )
-            if layout.has_clock:
+            if layout.has_time_offset:
                 # the noise of the central difference that gives the member's velocity: half of S from
                 # the member, at both ends of two periods
-                at = columns[m].start + layout.clock.start
+                at = columns[m].start + layout.time_offset.start
                 total[at, at] += 1.5 * len(group.steps) / problem.members[m].period_s ** 2
     return total
 
 
 @dataclass(frozen=True, eq=False)
-class Determined:
+class ObservableSplit:
     """What of the unknowns the equations determine.
 
-    basis: (P, q) directions along which the raw information is the identity. genuine: (q,) the share of it
-    that noise did not feign, in (0, 1]. rest: (P, P - q) directions without genuine information.
+    basis: (P, q) directions along which the raw information is the identity. genuine: (q,) the fraction of it
+    that noise did not add spurious, in (0, 1]. rest: (P, P - q) directions without genuine information.
     """
 
     basis: Array
@@ -175,26 +182,28 @@ class Determined:
         return self.rest / np.maximum(lengths, 1e-300)
 
 
-def determined(equations: Equations, doubt: float) -> Determined:
-    """Split the unknowns; a direction counts if its genuine information exceeds `doubt` times the feigned."""
-    information, feigned = equations.information, equations.feigned
-    return Determined(*normal_kernels.determined(information, feigned, float(doubt), _ROUNDING))
+def split_observable(equations: Equations, required_ratio: float) -> ObservableSplit:
+    """Split the unknowns; a direction counts if its genuine information exceeds `required_ratio` times the spurious."""
+    information, spurious = equations.information, equations.spurious
+    return ObservableSplit(
+        *normal_kernels.split_observable(information, spurious, float(required_ratio), _ROUNDING)
+    )
 
 
-def doubt_of(problem: HandeyeProblem, used: int) -> float:
-    """How much genuine information must exceed what is feigned.
+def required_information_ratio(problem: HandeyeProblem, used: int) -> float:
+    """How much genuine information must exceed what is spurious.
 
-    With known noise the feigned information is known up to its scatter, of which five standard deviations
+    With known noise the spurious information is known up to its scatter, of which five standard deviations
     are asked for. Learnt levels, and their split between both sides, may be off by as much as themselves.
     """
     return 5.0 * float(np.sqrt(2 / max(used, 1))) if problem.has_known_noise else 1.0
 
 
-def useful_units(layouts: Sequence[Layout]) -> Array:
+def useful_units(layouts: Sequence[MountingLayout]) -> Array:
     """(P,) the deviation at which each unknown is as good as open."""
     frame = [USEFUL_ROTATION] * 3 + [USEFUL_TRANSLATION] * 3
     units: list[float] = []
     for layout in layouts:
         units += frame * (1 + layout.world_count)
-        units += [USEFUL_CLOCK] * layout.has_clock + [USEFUL_LOG_SCALE] * layout.scale_count
+        units += [USEFUL_TIME_OFFSET] * layout.has_time_offset + [USEFUL_LOG_SCALE] * layout.scale_count
     return np.array(units)

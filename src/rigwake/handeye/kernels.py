@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array
 from rigwake.handeye.se3_kernels import (
     Tangent,
     Transform,
@@ -157,7 +157,7 @@ def sample(
 
 @njit(cache=True)
 def _cubic(D: Tangent, start: Tangent, end: Tangent, a: float) -> Tangent:
-    """The cubic over the increment D at the share `a` of it; start, end: velocities times its duration."""
+    """The cubic over the increment D at the fraction `a` of it; start, end: velocities times its duration."""
     turned = bracket(D, end)  # half of it: J_r^-1(D) to first order
     d, s, e = (3 - 2 * a) * a * a, a * (1 - a) ** 2, -a * a * (1 - a)
     h = 0.5 * e
@@ -246,12 +246,12 @@ def jacobians(
     segments: NDArray[np.int64],
     valid: NDArray[np.bool_],
     world_count: int,
-    has_clock: bool,
+    has_time_offset: bool,
     scale_count: int,
 ) -> Array:
     """(N, 6, P) of the residuals by mounting, worlds, clock and logarithms of the scales; zero if not valid."""
-    clock = 6 + 6 * world_count
-    out = np.zeros((len(valid), 6, clock + has_clock + scale_count))
+    time_offset = 6 + 6 * world_count
+    out = np.zeros((len(valid), 6, time_offset + has_time_offset + scale_count))
     for k in range(len(valid)):
         if not valid[k]:
             continue
@@ -261,12 +261,14 @@ def jacobians(
             J[i, i] = 1.0
             for j in range(6):
                 J[i, moved + j] -= adjoints[k, i, j]
-        if has_clock:
+        if has_time_offset:
             for i in range(6):
-                J[i, clock] = twists_after[k, i] * (1.0 if i < 3 else scales[s])
+                J[i, time_offset] = twists_after[k, i] * (1.0 if i < 3 else scales[s])
                 for j in range(6):
-                    J[i, clock] -= adjoints[k, i, j] * twists_before[k, j] * (1.0 if j < 3 else scales[s])
+                    J[i, time_offset] -= (
+                        adjoints[k, i, j] * twists_before[k, j] * (1.0 if j < 3 else scales[s])
+                    )
         if s < scale_count:
             for i in range(3):
-                J[3 + i, clock + has_clock + s] = -ways[k, i]
+                J[3 + i, time_offset + has_time_offset + s] = -ways[k, i]
     return out

@@ -2,7 +2,7 @@
 
 An error of the reference's rotation moves the member by the lever arm p (the reference's origin in the member's
 axes), an error of the member's own rotation does not. So a residual `r = [r_R, r_t]` whose rotation variance v is
-to the share s the reference's, and whose translation variance is q by itself, has
+to the fraction s the reference's, and whose translation variance is q by itself, has
 
     r_t | r_R ~ N(s p x r_R,  q along p,  q + s (1 - s) v |p|^2 across p).
 
@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from scipy.stats import chi2
 
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array
 
 _LOGIT_RANGE = 5.0  # shares of 0.7 to 99.3 %
 _COARSE, _FINE = 11, 14  # shares tried, then steps of the golden section
@@ -36,22 +36,22 @@ _GOLDEN = (math.sqrt(5.0) - 1) / 2
 
 @dataclass(frozen=True)
 class LeverArmLevels:
-    """share: part of the rotation's variance that is the reference's. translation: its own variance per axis, m^2."""
+    """fraction: part of the rotation's variance that is the reference's. translation: its own variance per axis, m^2."""
 
-    share: float
+    fraction: float
     translation: float
 
 
 def levels_by_lever_arm(
-    residuals: Array, arm: Array, rotation: float, share: float | None = None
+    residuals: Array, arm: Array, rotation: float, fraction: float | None = None
 ) -> LeverArmLevels:
     """Maximum likelihood of share and translation level, under the loss of the estimate itself.
 
-    residuals: (N, 6). arm: (3,) p in metres. rotation: v, rad^2 per axis. share: if known from elsewhere.
+    residuals: (N, 6). arm: (3,) p in metres. rotation: v, rad^2 per axis. fraction: if known from elsewhere.
     A weak prior, Beta(2, 2), decides where the arm is too short to tell. Outliers weigh as in Huber's loss up to
     `_FAR` times its limit, beyond that they count no more.
     """
-    given = -1.0 if share is None else share
+    given = -1.0 if fraction is None else fraction
     found, level = _levels(
         np.ascontiguousarray(residuals), np.asarray(arm, dtype=np.float64), rotation, given
     )
@@ -67,17 +67,17 @@ def _levels(residuals: Array, arm: Array, v: float, given: float) -> tuple[float
     for k in range(len(squares)):
         moved[k] = squares[k, 1] + squares[k, 2]
     typical = np.median(moved) / _MEDIAN if len(moved) else 1.0
-    share, q, swing, means = 0.5, typical + TRANSLATION_FLOOR**2, 0.0, np.zeros(5)
+    fraction, q, arm_variance, means = 0.5, typical + TRANSLATION_FLOOR**2, 0.0, np.zeros(5)
     for _ in range(_ROUNDS):
-        means = _weighted_means(squares, share, v, q, q + share * (1 - share) * swing)
-        swing = v * length2
-        share = given if given >= 0 else _share_of(_best_logit(means, swing, len(squares)))
-        q = _level(share, means, swing)
+        means = _weighted_means(squares, fraction, v, q, q + fraction * (1 - fraction) * arm_variance)
+        arm_variance = v * length2
+        fraction = given if given >= 0 else _fraction_of(_best_logit(means, arm_variance, len(squares)))
+        q = _level(fraction, means, arm_variance)
     if given < 0:
-        logit = math.log(share / (1 - share))
-        share = _share_of(_refined(logit, means, swing, len(squares)))
-        q = _level(share, means, swing)
-    return share, q
+        logit = math.log(fraction / (1 - fraction))
+        fraction = _fraction_of(_refined(logit, means, arm_variance, len(squares)))
+        q = _level(fraction, means, arm_variance)
+    return fraction, q
 
 
 @njit(cache=True)
@@ -103,11 +103,11 @@ def _squares(residuals: Array, arm: Array) -> Array:
 
 
 @njit(cache=True)
-def _weighted_means(squares: Array, share: float, turned: float, along: float, across: float) -> Array:
+def _weighted_means(squares: Array, fraction: float, turned: float, along: float, across: float) -> Array:
     """(5,) means over the residuals, outliers of these variances weighing less."""
     sums = np.zeros(5)
     for k in range(len(squares)):
-        moved = squares[k, 2] - 2 * share * squares[k, 3] + share * share * squares[k, 4]
+        moved = squares[k, 2] - 2 * fraction * squares[k, 3] + fraction * fraction * squares[k, 4]
         weight = _weight(squares[k, 0] / turned + squares[k, 1] / along + moved / across)
         for j in range(5):
             sums[j] += weight * squares[k, j]
@@ -126,16 +126,16 @@ def _weight(squared: float) -> float:
 
 
 @njit(cache=True)
-def _across(share: float, means: Array) -> float:
-    """Mean square per axis across the arm of what the share leaves."""
-    return (means[2] - 2 * share * means[3] + share * share * means[4]) / 2
+def _across(fraction: float, means: Array) -> float:
+    """Mean square per axis across the arm of what the fraction leaves."""
+    return (means[2] - 2 * fraction * means[3] + fraction * fraction * means[4]) / 2
 
 
 @njit(cache=True)
-def _level(share: float, means: Array, swing: float) -> float:
+def _level(fraction: float, means: Array, arm_variance: float) -> float:
     """q that maximises the likelihood, by Fisher scoring."""
     least = _LEAST * (means[1] + means[2]) + TRANSLATION_FLOOR**2
-    extra, across = share * (1 - share) * swing, _across(share, means)
+    extra, across = fraction * (1 - fraction) * arm_variance, _across(fraction, means)
     q = max(means[1], least)
     for _ in range(_SCORINGS):
         a, b = 1 / (q * q), 2 / (q + extra) ** 2
@@ -144,45 +144,45 @@ def _level(share: float, means: Array, swing: float) -> float:
 
 
 @njit(cache=True)
-def _cost(logit: float, means: Array, swing: float, count: int) -> float:
+def _cost(logit: float, means: Array, arm_variance: float, count: int) -> float:
     """Minus twice the logarithm of the likelihood and the prior per residual, at the best q."""
-    share = _share_of(logit)
-    q = _level(share, means, swing)
-    wide = q + share * (1 - share) * swing
-    cost = math.log(q) + means[1] / q + 2 * math.log(wide) + 2 * _across(share, means) / wide
-    return cost - 2 * math.log(share * (1 - share)) / max(count, 1)
+    fraction = _fraction_of(logit)
+    q = _level(fraction, means, arm_variance)
+    wide = q + fraction * (1 - fraction) * arm_variance
+    cost = math.log(q) + means[1] / q + 2 * math.log(wide) + 2 * _across(fraction, means) / wide
+    return cost - 2 * math.log(fraction * (1 - fraction)) / max(count, 1)
 
 
 @njit(cache=True)
-def _best_logit(means: Array, swing: float, count: int) -> float:
+def _best_logit(means: Array, arm_variance: float, count: int) -> float:
     """The best of a grid of shares."""
     best, lowest = 0.0, math.inf
     for k in range(_COARSE):
         logit = k * _STEP - _LOGIT_RANGE
-        cost = _cost(logit, means, swing, count)
+        cost = _cost(logit, means, arm_variance, count)
         if cost < lowest:
             best, lowest = logit, cost
     return best
 
 
 @njit(cache=True)
-def _refined(logit: float, means: Array, swing: float, count: int) -> float:
-    """Golden section about a value of the grid, so that the share does not jump when the residuals hardly move."""
+def _refined(logit: float, means: Array, arm_variance: float, count: int) -> float:
+    """Golden section about a value of the grid, so that the fraction does not jump when the residuals hardly move."""
     low, high = logit - _STEP, logit + _STEP
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    at_left, at_right = _cost(left, means, swing, count), _cost(right, means, swing, count)
+    at_left, at_right = _cost(left, means, arm_variance, count), _cost(right, means, arm_variance, count)
     for _ in range(_FINE):
         if at_left < at_right:
             high, right, at_right = right, left, at_left
             left = high - _GOLDEN * (high - low)
-            at_left = _cost(left, means, swing, count)
+            at_left = _cost(left, means, arm_variance, count)
         else:
             low, left, at_left = left, right, at_right
             right = low + _GOLDEN * (high - low)
-            at_right = _cost(right, means, swing, count)
+            at_right = _cost(right, means, arm_variance, count)
     return (low + high) / 2
 
 
 @njit(cache=True)
-def _share_of(logit: float) -> float:
+def _fraction_of(logit: float) -> float:
     return 1 / (1 + math.exp(-logit))

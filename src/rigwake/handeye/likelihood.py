@@ -13,18 +13,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array
 from rigwake.handeye import normal_kernels
+from rigwake.handeye.handeye_problem import HandeyeProblem, step_covariances
+from rigwake.handeye.handeye_result import HandeyeOptions
 from rigwake.handeye.information import (
-    USEFUL_CLOCK,
     USEFUL_ROTATION,
+    USEFUL_TIME_OFFSET,
     USEFUL_TRANSLATION,
     Equations,
     Group,
-    determined,
-    doubt_of,
     form_equations,
     group_steps,
+    required_information_ratio,
+    split_observable,
     useful_units,
 )
 from rigwake.handeye.motions import Mounting, residuals
@@ -36,8 +38,6 @@ from rigwake.handeye.noise import (
     learnt_noise,
     robust_mean_square,
 )
-from rigwake.handeye.problem import HandeyeProblem, step_covariances
-from rigwake.handeye.values import HandeyeOptions
 
 _MOVES_LESS = 1e-3  # of a standard deviation: converged
 _JUDGED = 1.0  # standard deviations from its end: near enough to compare with another model
@@ -47,7 +47,7 @@ _LONGEST_TURN, _LONGEST_WAY = 0.5, 20.0  # radians, metres in one step
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class HandeyeEstimate:
     """The solver's end: unknowns, the normal equations and (N, 6) residuals there, and how it went.
 
     valid, segments: (N, M) steps that a member knows, and the index of its segment.
@@ -59,7 +59,7 @@ class Estimate:
     valid: NDArray[np.bool_]
     segments: NDArray[np.int64]
     filters: tuple[Jitter, ...]
-    doubt: float
+    required_ratio: float
     iterations: int
     converged: bool
 
@@ -109,29 +109,29 @@ class _Solver:
             groups=self.groups,
         )
 
-    def step(self, doubt: float) -> float:
+    def step(self, required_ratio: float) -> float:
         """One Gauss-Newton step; its length in standard deviations."""
         self.latest = self.equations()
-        tangent, moved = _bounded_step(self.latest, self.limits, doubt)
+        tangent, moved = _bounded_step(self.latest, self.limits, required_ratio)
         parts = [tangent[columns] for columns in self.problem.columns]
         moves = list(zip(self.mountings, parts, self.problem.layouts, strict=True))
-        clocks_moved = any(part[layout.clock].any() for _, part, layout in moves)
-        self.move_to(tuple(x.retract(part, layout) for x, part, layout in moves), resample=clocks_moved)
+        time_offsets_moved = any(part[layout.time_offset].any() for _, part, layout in moves)
+        self.move_to(tuple(x.retract(part, layout) for x, part, layout in moves), resample=time_offsets_moved)
         return moved
 
-    def estimate(self, doubt: float, iterations: int, *, converged: bool) -> Estimate:
+    def estimate(self, required_ratio: float, iterations: int, *, converged: bool) -> HandeyeEstimate:
         """Where the solver stands."""
         segments = np.array([s.segments for s in self.steps]).T
         at = (self.mountings, self.latest, self.residuals, self.valid, segments, self.filters)
-        return Estimate(*at, doubt, iterations, converged)
+        return HandeyeEstimate(*at, required_ratio, iterations, converged)
 
 
 def maximise(
     problem: HandeyeProblem,
     start: Sequence[Mounting],
     options: HandeyeOptions,
-    worthwhile: Callable[[Estimate], bool] | None = None,
-) -> Estimate:
+    worthwhile: Callable[[HandeyeEstimate], bool] | None = None,
+) -> HandeyeEstimate:
     """Gauss-Newton from `start` until the next step would move nothing by more than a thousandth of its deviation.
 
     The next step is expected to be shorter than this one as this one is than the last.
@@ -140,30 +140,30 @@ def maximise(
     """
     solver = _Solver(problem, start, options)
     learning = problem.noise == "estimated"
-    doubt = doubt_of(problem, int(solver.valid.any(axis=1).sum()))
+    required_ratio = required_information_ratio(problem, int(solver.valid.any(axis=1).sum()))
     moved, ahead, iterations, settled, enough = np.inf, np.inf, 0, not learning, _MOVES_LESS
     while (ahead > enough or not settled) and iterations < options.max_iterations:
         if learning and moved < _SETTLED:
             solver.learn_filters()
             settled = True
-        before, moved = moved, solver.step(doubt)
+        before, moved = moved, solver.step(required_ratio)
         ahead = moved * min(1.0, moved / before) if 0 < before < np.inf else moved
         iterations += 1
         if worthwhile is not None and moved < _JUDGED:
-            so_far = solver.estimate(doubt, iterations, converged=ahead <= enough)
+            so_far = solver.estimate(required_ratio, iterations, converged=ahead <= enough)
             if not worthwhile(so_far):
                 return so_far
             worthwhile = None
         if iterations % _PATIENCE == 0:
             # what comes and goes with every step is on the edge: a direction of being determined (give it
             # up), a pose of the shared time (it moves the estimate by little)
-            doubt, enough = 2 * doubt, 10 * enough
+            required_ratio, enough = 2 * required_ratio, 10 * enough
     if ahead > enough:
         solver.latest = solver.equations()
-    return solver.estimate(doubt, iterations, converged=ahead <= enough)
+    return solver.estimate(required_ratio, iterations, converged=ahead <= enough)
 
 
-def information_criterion(problem: HandeyeProblem, estimate: Estimate) -> float:
+def information_criterion(problem: HandeyeProblem, estimate: HandeyeEstimate) -> float:
     """Schwarz's criterion (BIC) of learnt noise, lower is better: how well the past predicts each residual.
 
     Comparable between increments and poses, for increments are the poses' differences: a change of variables
@@ -185,14 +185,14 @@ def _longest_step(units: Array) -> Array:
     limits = np.full(len(units), np.inf)
     limits[units == USEFUL_ROTATION] = _LONGEST_TURN
     limits[units == USEFUL_TRANSLATION] = _LONGEST_WAY
-    limits[units == USEFUL_CLOCK] = USEFUL_CLOCK
+    limits[units == USEFUL_TIME_OFFSET] = USEFUL_TIME_OFFSET
     return limits
 
 
-def _bounded_step(equations: Equations, limits: Array, doubt: float) -> tuple[Array, float]:
+def _bounded_step(equations: Equations, limits: Array, required_ratio: float) -> tuple[Array, float]:
     """The Gauss-Newton step along what is determined, and its length in standard deviations.
 
     Along the rest the likelihood follows the noise, often towards infinity; it stays where it started.
     """
-    basis = determined(equations, doubt).basis
+    basis = split_observable(equations, required_ratio).basis
     return normal_kernels.bounded_step(basis, equations.scores, limits)

@@ -9,8 +9,8 @@ is pure noise, whatever the motion was. For absolute poses the same holds with t
 of the motions and `Y = world_ref_from_world_member`, an unknown of its own. Both are one problem here.
 
 The Jacobian of r contains the measured motion, hence its errors: taken as it stands, it would pull weakly
-excited directions towards zero and feign information (errors in variables). It is therefore evaluated at the
-motion that both sides agree on, `C = X^-1 A exp(-g) X` with g the share of r that A is to blame for; its
+excited directions towards zero and add spurious information (errors in variables). It is therefore evaluated at the
+motion that both sides agree on, `C = X^-1 A exp(-g) X` with g the fraction of r that A is to blame for; its
 error is then independent of r (profile likelihood over the true motions).
 """
 
@@ -22,8 +22,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._types import Array
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.handeye import kernels, normal_kernels
 from rigwake.handeye.resample import Sampled
 
@@ -40,16 +40,16 @@ class Mounting:
     time_offset_s: float
     log_scales: Array
 
-    def retract(self, step: Array, layout: Layout) -> Mounting:
+    def retract(self, step: Array, layout: MountingLayout) -> Mounting:
         """The unknowns after a step in the order of `layout`."""
         worlds = self.worlds
         if worlds is not None:
             worlds = retracted(worlds, step[layout.worlds].reshape(-1, 6))
-        clock = float(step[layout.clock].sum())
+        time_offset = float(step[layout.time_offset].sum())
         log_scales = self.log_scales.copy()
         log_scales[: layout.scale_count] += step[layout.scales]
         X = retracted(self.ref_from_member[None], step[None, :6])[0]
-        return Mounting(X, worlds, self.time_offset_s + clock, log_scales)
+        return Mounting(X, worlds, self.time_offset_s + time_offset, log_scales)
 
 
 def retracted(transforms: SE3, deltas: Array) -> SE3:
@@ -59,11 +59,11 @@ def retracted(transforms: SE3, deltas: Array) -> SE3:
 
 
 @dataclass(frozen=True)
-class Layout:
+class MountingLayout:
     """Where the unknowns of one member stand in its columns: mounting, worlds, clock, scales."""
 
     world_count: int
-    has_clock: bool
+    has_time_offset: bool
     scale_count: int
 
     @cached_property
@@ -72,14 +72,14 @@ class Layout:
         return slice(6, 6 + 6 * self.world_count)
 
     @cached_property
-    def clock(self) -> slice:
+    def time_offset(self) -> slice:
         """The time offset, if estimated."""
-        return slice(self.worlds.stop, self.worlds.stop + self.has_clock)
+        return slice(self.worlds.stop, self.worlds.stop + self.has_time_offset)
 
     @cached_property
     def scales(self) -> slice:
         """One logarithm of a scale per segment, if estimated."""
-        return slice(self.clock.stop, self.clock.stop + self.scale_count)
+        return slice(self.time_offset.stop, self.time_offset.stop + self.scale_count)
 
     @cached_property
     def size(self) -> int:
@@ -151,7 +151,9 @@ def residuals(steps: Steps, mounting: Mounting) -> Array:
     )
 
 
-def linearise(steps: Steps, mounting: Mounting, layout: Layout, reference_errors: Array) -> Linearised:
+def linearise(
+    steps: Steps, mounting: Mounting, layout: MountingLayout, reference_errors: Array
+) -> Linearised:
     """Jacobians at `mounting`.
 
     reference_errors: (N, 6) estimated errors of the reference, in the member's tangent: `Ad(X^-1) a`.
@@ -174,7 +176,7 @@ def linearise(steps: Steps, mounting: Mounting, layout: Layout, reference_errors
         steps.segments,
         steps.valid,
         layout.world_count,
-        layout.has_clock,
+        layout.has_time_offset,
         layout.scale_count,
     )
     return Linearised(J, adjoints, ways)
@@ -189,10 +191,10 @@ def _frames(mounting: Mounting) -> tuple[Array, Array, Array, Array]:
     return R, t, R_X, t_X
 
 
-def feigned_information(
+def spurious_information(
     steps: Steps,
     linear: Linearised,
-    layout: Layout,
+    layout: MountingLayout,
     chosen: NDArray[np.int64],
     errors: Array,
     weights: Array,
@@ -205,7 +207,7 @@ def feigned_information(
     thinned = slice(None, None, max(1, len(chosen) // 100))
     some = chosen[thinned]
     covariances, W = (np.ascontiguousarray(x if len(x) == 1 else x[thinned]) for x in (errors, weights))
-    total = normal_kernels.feigned(
+    total = normal_kernels.spurious(
         covariances,
         W,
         linear.adjoints,

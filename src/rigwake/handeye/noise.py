@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from rigwake._types import Array
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.handeye import noise_kernels, normal_kernels
 from rigwake.handeye.lever_arm import TRANSLATION_FLOOR, levels_by_lever_arm
-from rigwake.handeye.resample import Curve
+from rigwake.handeye.resample import TrajectoryCurve
 
 ROTATION_FLOOR = 1e-9  # rad; nothing is known better than rounding allows
 FLOOR = np.repeat([ROTATION_FLOOR**2, TRANSLATION_FLOOR**2], 3)
@@ -45,7 +45,7 @@ class StepNoise:
         return StepNoise(self.total[pick], self.of_reference[pick])
 
     def inverse(self) -> tuple[Array, Array, Array]:
-        """S^-1; Sa S^-1, the share of a residual that is the reference's; what that leaves of Sa."""
+        """S^-1; Sa S^-1, the fraction of a residual that is the reference's; what that leaves of Sa."""
         return normal_kernels.inverted(self.total, self.of_reference)
 
 
@@ -74,25 +74,27 @@ def learnt_noise(
     found = noise_kernels.learnt_covariances(
         residuals, known, by_axis, ROTATION_FLOOR**2, _CHI2_MEDIAN, _CHI2_LIMIT
     )
-    shares, pairs = np.full((2, len(R)), 0.5), _pairs(known)
+    fractions, pairs = np.full((2, len(R)), 0.5), _pairs(known)
     turn = _shared_rotation(residuals, mountings, pairs) if pairs else 0.0
     for m, X in enumerate(mountings):
         r, arm = residuals[known[:, m], 6 * m : 6 * m + 6], -X.translation @ X.rotation
-        told = _share(turn, found[m, 0], 0.01) if pairs else None
-        levels = levels_by_lever_arm(r, arm, float(np.trace(found[m, 0])) / 3, told)
-        shares[0, m] = levels.share
+        known_fraction = _fraction(turn, found[m, 0], 0.01) if pairs else None
+        levels = levels_by_lever_arm(r, arm, float(np.trace(found[m, 0])) / 3, known_fraction)
+        fractions[0, m] = levels.fraction
         found[m, 1] = (
-            noise_kernels.without_swing(found[m, 1], found[m, 0], arm, levels.share, TRANSLATION_FLOOR**2)
+            noise_kernels.subtract_arm_variance(
+                found[m, 1], found[m, 0], arm, levels.fraction, TRANSLATION_FLOOR**2
+            )
             if by_axis
             else levels.translation * _UNIT
         )
     if pairs:
-        way = _shared_translation(residuals, mountings, pairs, shares[0], turn)
-        shares[1] = [_share(way, own, 0.1) for own in found[:, 1]]
-    return StepNoise(*noise_kernels.propagated(R, t, *noise_kernels.split(R, found, shares), FLOOR))
+        way = _shared_translation(residuals, mountings, pairs, fractions[0], turn)
+        fractions[1] = [_fraction(way, own, 0.1) for own in found[:, 1]]
+    return StepNoise(*noise_kernels.propagated(R, t, *noise_kernels.split(R, found, fractions), FLOOR))
 
 
-def _share(shared: float, own: Array, least: float) -> float:
+def _fraction(shared: float, own: Array, least: float) -> float:
     """Part of a covariance (3, 3) that is the reference's, from the mean of `r_m . r_n` of pairs of members."""
     return float(np.clip(shared / max(float(np.trace(own)), 1e-300), least, 1 - least))
 
@@ -110,17 +112,17 @@ def _shared_rotation(residuals: Array, mountings: Sequence[SE3], pairs: _Pairs) 
 
 
 def _shared_translation(
-    residuals: Array, mountings: Sequence[SE3], pairs: _Pairs, shares: Array, turn: float
+    residuals: Array, mountings: Sequence[SE3], pairs: _Pairs, fractions: Array, turn: float
 ) -> float:
     """The same of translations, less what the reference's rotation, `turn` its |a_R|^2, moves both by.
 
-    Most of that is what the share of the rotation residuals explains, and is taken off each member first.
+    Most of that is what the fraction of the rotation residuals explains, and is taken off each member first.
     """
     rows, left = [], []
-    for m, (X, share) in enumerate(zip(mountings, shares, strict=True)):
+    for m, (X, fraction) in enumerate(zip(mountings, fractions, strict=True)):
         r = residuals[:, 6 * m : 6 * m + 6]
-        rows.append((r[:, 3:] - share * np.cross(X.inverse().translation, r[:, :3])) @ X.rotation.T)
-        left.append((1 - share) * X.translation)
+        rows.append((r[:, 3:] - fraction * np.cross(X.inverse().translation, r[:, :3])) @ X.rotation.T)
+        left.append((1 - fraction) * X.translation)
     return _mean_product(rows, np.array(left), pairs, 2 / 3 * turn)
 
 
@@ -191,7 +193,7 @@ def fit_jitter(residuals: Array, valid: NDArray[np.bool_]) -> Jitter:
     return Jitter(thetas[rotation], thetas[translation])
 
 
-def noise_over_steps(covariances: Array, curve: Curve, times_s: Array, absolute: bool) -> Array:
+def noise_over_steps(covariances: Array, curve: TrajectoryCurve, times_s: Array, absolute: bool) -> Array:
     """Covariances of a trajectory's poses, or of its motions between neighbouring `times_s`: (., 6, 6).
 
     Increments add up along the way (their small rotation between is neglected); a step that covers part of

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array
 
 
 @njit(cache=True)
@@ -75,15 +75,15 @@ def learnt_covariances(
 
 
 @njit(cache=True)
-def without_swing(moved: Array, turned: Array, arm: Array, share: float, floor: float) -> Array:
-    """Covariance (3, 3) of translations less what the share of the rotations' moves the arm by; no direction below
+def subtract_arm_variance(moved: Array, turned: Array, arm: Array, fraction: float, floor: float) -> Array:
+    """Covariance (3, 3) of translations less what the fraction of the rotations' moves the arm by; no direction below
     a twentieth of the widest."""
-    turn, swung, out = np.zeros((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
+    turn, arm_covariance, out = np.zeros((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         turn[k, j], turn[j, k] = arm[i], -arm[i]
-    _sandwich(turn, turned, swung)
-    values, vectors = np.linalg.eigh(moved - share * swung)
+    _sandwich(turn, turned, arm_covariance)
+    values, vectors = np.linalg.eigh(moved - fraction * arm_covariance)
     least = 0.05 * max(values[2], 0.0) + floor
     for c in range(3):
         for i in range(3):
@@ -136,26 +136,26 @@ def _robust_covariance(
                 for i in range(3):
                     for j in range(3):
                         length += rows[k, first + i] * inverse[i, j] * rows[k, first + j]
-                share = min(1.0, limit / max(length, 1e-300)) / len(squared)
+                fraction = min(1.0, limit / max(length, 1e-300)) / len(squared)
                 for i in range(3):
                     for j in range(3):
-                        out[i, j] += share * rows[k, first + i] * rows[k, first + j]
+                        out[i, j] += fraction * rows[k, first + i] * rows[k, first + j]
 
 
 @njit(cache=True)
-def split(R: Array, found: Array, shares: Array) -> tuple[Array, Array]:
-    """Covariances (M, 2, 3, 3) of the errors of both sides as the reference's (1, 6, 6), the mean of its `shares`
+def split(R: Array, found: Array, fractions: Array) -> tuple[Array, Array]:
+    """Covariances (M, 2, 3, 3) of the errors of both sides as the reference's (1, 6, 6), the mean of its `fractions`
     (2, M) in its own axes, and the members' (M, 1, 6, 6)."""
     count = len(R)
     reference, members, turned = np.zeros((1, 6, 6)), np.zeros((count, 1, 6, 6)), np.empty((3, 3))
     for m in range(count):
         for part in range(2):
-            at, share = 3 * part, shares[part, m]
+            at, fraction = 3 * part, fractions[part, m]
             _sandwich(R[m], found[m, part], turned)
             for i in range(3):
                 for j in range(3):
-                    members[m, 0, at + i, at + j] = (1 - share) * found[m, part, i, j]
-                    reference[0, at + i, at + j] += share / count * turned[i, j]
+                    members[m, 0, at + i, at + j] = (1 - fraction) * found[m, part, i, j]
+                    reference[0, at + i, at + j] += fraction / count * turned[i, j]
     return reference, members
 
 

@@ -1,4 +1,4 @@
-"""Compiled normal equations: weights, information, scores, and the information that noise feigns."""
+"""Compiled normal equations: weights, information, scores, and the information that noise adds spuriously."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array
 
 _TILE = 2048  # steps at a time: fits the cache
 
@@ -18,7 +18,7 @@ def inverted(total: Array, of_reference: Array) -> tuple[Array, Array, Array]:
     """Of covariances (n, p, p): `S^-1`, `Sa S^-1` and `Sa - Sa S^-1 Sa`. S is scaled to unit diagonal to be
     inverted (rotation and translation differ by many decades)."""
     p = total.shape[1]
-    inverses, blames, left = np.empty_like(total), np.empty_like(total), np.empty_like(total)
+    inverses, gains, left = np.empty_like(total), np.empty_like(total), np.empty_like(total)
     scale, normalised = np.empty(p), np.empty((p, p))
     for k in range(len(total)):
         for i in range(p):
@@ -30,12 +30,12 @@ def inverted(total: Array, of_reference: Array) -> tuple[Array, Array, Array]:
         for i in range(p):
             for j in range(p):
                 inverses[k, i, j] = inverse[i, j] * scale[i] * scale[j]
-        np.dot(of_reference[k], inverses[k], blames[k])
-        np.dot(blames[k], of_reference[k], left[k])
+        np.dot(of_reference[k], inverses[k], gains[k])
+        np.dot(gains[k], of_reference[k], left[k])
         for i in range(p):
             for j in range(p):
                 left[k, i, j] = of_reference[k, i, j] - left[k, i, j]
-    return inverses, blames, left
+    return inverses, gains, left
 
 
 @njit(cache=True)
@@ -45,7 +45,7 @@ def weigh(
     steps: NDArray[np.int64],
     rows: NDArray[np.int64],
     inverse: Array,
-    blame: Array,
+    gain: Array,
     limit: float,
     weights: Array,
     reference_errors: Array,
@@ -69,7 +69,7 @@ def weigh(
             weighted[i, a] *= rho
             error = 0.0
             for b in range(len(rows)):
-                error += blame[w, a, b] * residuals[k, rows[b]]
+                error += gain[w, a, b] * residuals[k, rows[b]]
             reference_errors[k, rows[a]] = rho * error
     return weighted
 
@@ -139,7 +139,7 @@ def add_scores(J: Array, weighted: Array, first: int, steps: NDArray[np.int64], 
 
 
 @njit(cache=True)
-def feigned(
+def spurious(
     covariances: Array,
     weights: Array,
     adjoints: Array,
@@ -223,10 +223,10 @@ def _spread(units: Array, covariance: Array, W: Array) -> Array:
 
 
 @njit(cache=True)
-def determined(
-    information: Array, feigned: Array, doubt: float, rounding: float
+def split_observable(
+    information: Array, spurious: Array, required_ratio: float, rounding: float
 ) -> tuple[Array, Array, Array]:
-    """See `information.determined`: basis (P, q), genuine (q,), rest (P, P - q).
+    """See `information.split_observable`: basis (P, q), genuine (q,), rest (P, P - q).
 
     The matrix is scaled to unit diagonal first: only then are its small eigenvalues those of the motion and
     not of rounding, for the unknowns differ by many decades.
@@ -249,11 +249,11 @@ def determined(
         for c in range(present):
             whitened[i, c] = vectors[i, absent + c] * scale[i] / math.sqrt(values[absent + c])
     if present > 0:
-        within = np.eye(present) - np.dot(whitened.T, np.dot(feigned, whitened))
+        within = np.eye(present) - np.dot(whitened.T, np.dot(spurious, whitened))
         genuine, turned = np.linalg.eigh(within)
         whitened = np.dot(whitened, turned)
     first = 0
-    while first < present and genuine[first] <= doubt * (1 - genuine[first]):
+    while first < present and genuine[first] <= required_ratio * (1 - genuine[first]):
         first += 1
     rest = np.empty((size, absent + first))
     for i in range(size):

@@ -1,6 +1,6 @@
 """What the motion determined, how well, in words, and which motion would help.
 
-The information matrix holds two parts: what the true motion gave, and what the noise feigned (see `motions`).
+The information matrix holds two parts: what the true motion gave, and what the noise added spuriously (see `motions`).
 Only the first counts. Directions are judged in units at which a result is as good as none: 5 degrees, 1 m,
 0.1 s, a factor e in scale. A direction is open when its standard deviation exceeds one such unit, or when the
 excitation found does not stand out from the noise. Open directions enter the covariance with ten units, so
@@ -14,18 +14,18 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.calibration.values import UndeterminedDirection
+from rigwake._types import Array
+from rigwake.calibration.rig_calibration import UnobservableDirection
 from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
-from rigwake.geometry.so3 import Array
+from rigwake.handeye.handeye_problem import HandeyeProblem
 from rigwake.handeye.information import (
     USEFUL_ROTATION,
     USEFUL_TRANSLATION,
     Equations,
-    determined,
+    split_observable,
     useful_units,
 )
-from rigwake.handeye.likelihood import Estimate
-from rigwake.handeye.problem import HandeyeProblem
+from rigwake.handeye.likelihood import HandeyeEstimate
 
 _OPEN_UNITS = 10.0  # how far an open direction may be off: 50 degrees, 10 m
 _BLOCKS = 30  # of time, whose scores are taken to be independent
@@ -34,7 +34,7 @@ _LONGEST = 0.98  # part of them that is left from pose to pose
 _NEGLIGIBLE = 0.02  # component of a direction that is not worth naming
 
 
-def covariance(problem: HandeyeProblem, estimate: Estimate) -> Array:
+def covariance(problem: HandeyeProblem, estimate: HandeyeEstimate) -> Array:
     """Covariance of all unknowns, open directions included: (P, P).
 
     Sandwich `H^-1 M H^-1` with H the genuine information. M is the raw information if the noise is known; it
@@ -44,7 +44,7 @@ def covariance(problem: HandeyeProblem, estimate: Estimate) -> Array:
     """
     equations = estimate.equations
     units = useful_units(problem.layouts)
-    split = determined(equations, estimate.doubt)
+    split = split_observable(equations, estimate.required_ratio)
     middle = np.eye(len(split.genuine))
     if not problem.has_known_noise:
         values, vectors = np.linalg.eigh(split.basis.T @ _scatter(equations) @ split.basis)
@@ -65,7 +65,7 @@ def _scatter(equations: Equations) -> Array:
     return np.asarray(blocks.T @ blocks * (len(blocks) / max(len(blocks) - 1, 1)))
 
 
-def _memory(estimate: Estimate) -> float:
+def _memory(estimate: HandeyeEstimate) -> float:
     """How many poses in a row amount to one independent error, of rotation or translation, whichever lasts longer:
     `1 + 2 rho_1 / (1 - phi)` for correlations `rho_k = rho_1 phi^(k-1)` with the k-th pose before, as of an error that
     lasts beside one that does not. (Without the latter phi is rho_1.)"""
@@ -89,10 +89,10 @@ def _correlation(rows: Array, valid: NDArray[np.bool_], lag: int) -> float:
     return float(np.sum(before * after) / scale) if scale > 0 else 0.0
 
 
-def open_directions(
-    reference: str, member: str, ref_from_member: SE3, member_covariance: Array, turns: Array
-) -> tuple[UndeterminedDirection, ...]:
-    """Directions of one mounting, in the axes of the reference, that are not determined.
+def unobservable_directions(
+    reference: str, member: str, ref_from_member: SE3, member_covariance: Array, rotations: Array
+) -> tuple[UnobservableDirection, ...]:
+    """Directions of one mounting, in the axes of the reference, that are unobservable.
 
     member_covariance: (6, 6) right tangent. turns: (N, 3) rotation vectors of the reference's motion.
     """
@@ -102,7 +102,7 @@ def open_directions(
     wide = vectors[:, values > 1.0] * units[:, None]
     directions = [_tidy(v) for v in _translations_first(wide)]
     return tuple(
-        UndeterminedDirection(d, _words(d, reference, member), _remedy(d, directions, turns))
+        UnobservableDirection(d, _words(d, reference, member), _remedy(d, directions, rotations))
         for d in directions
     )
 
@@ -154,13 +154,13 @@ def _axis_words(vector: Array) -> str:
     return "the direction (" + ", ".join(f"{u:+.2f}" for u in unit) + ")"
 
 
-def _remedy(direction: Array, all_open: Sequence[Array], turns: Array) -> str:
+def _remedy(direction: Array, all_open: Sequence[Array], rotations: Array) -> str:
     translations = sum(not np.any(d[:3]) for d in all_open)
     if np.any(direction[:3]):
         return "Move in a second direction, or turn about a second axis."
     if translations >= 2:
         return "Turn through at least 60 degrees, to both sides."
-    spread = np.linalg.svd(turns, compute_uv=False) if len(turns) else np.zeros(3)
-    if spread[0] > 0 and len(turns):
+    spread = np.linalg.svd(rotations, compute_uv=False) if len(rotations) else np.zeros(3)
+    if spread[0] > 0 and len(rotations):
         return "Record where waves (or a ramp, or a crane) roll and pitch the vehicle by some degrees."
     return "Turn about a second axis."

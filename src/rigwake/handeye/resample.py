@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._types import Array
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.handeye import kernels
 from rigwake.trajectory import Trajectory
 
@@ -38,7 +38,7 @@ class Sampled:
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class TrajectoryCurve:
     """A trajectory prepared for repeated interpolation.
 
     Between neighbouring poses j and j+1 the body follows `V_j exp(f(a))`, f the cubic Hermite polynomial in
@@ -58,7 +58,7 @@ class Curve:
     max_gap_s: float
 
     @classmethod
-    def of(cls, trajectory: Trajectory, max_gap_s: float | None = None) -> Curve:
+    def of(cls, trajectory: Trajectory, max_gap_s: float | None = None) -> TrajectoryCurve:
         """Prepare `trajectory`; gaps longer than `max_gap_s` (default: 10 median periods) are not bridged."""
         times = trajectory.times_s
         # contiguous copies: the kernels are compiled for one layout only

@@ -11,7 +11,7 @@ import math
 
 from numba import njit
 
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array
 
 Transform = tuple[float, ...]
 Tangent = tuple[float, ...]

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigwake.geometry.so3 import Array
-from rigwake.recording import Stamps
+from rigwake._types import Array, Stamps
 
 GAP_PERIODS = 1.6
 """Two stamps further apart than this many median periods enclose dropped samples."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from rigwake._types import Array
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 
 
 def board_pose(points_board: Array, bearings_cam: Array) -> SE3 | None:

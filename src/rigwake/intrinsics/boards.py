@@ -8,8 +8,8 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from rigwake._types import Array
 from rigwake.errors import UsageError
-from rigwake.geometry.so3 import Array
 
 BoardKind = Literal["chessboard", "aprilgrid", "charuco"]
 

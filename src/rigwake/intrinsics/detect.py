@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._types import Array
 from rigwake.errors import EstimationError, UsageError
-from rigwake.geometry.so3 import Array
+from rigwake.intrinsics.board_observations import MIN_CORNERS, BoardObservations, BoardView, gathered
 from rigwake.intrinsics.boards import Board
-from rigwake.intrinsics.observations import MIN_CORNERS, BoardObservations, BoardView, gathered
 
 Grey = NDArray[np.uint8]
 Found = tuple[NDArray[np.int64], Array]  # corner ids and pixels

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from rigwake._types import Array
 from rigwake.atomic import atomic_path
-from rigwake.geometry.so3 import Array
-from rigwake.intrinsics.calibrate import IntrinsicCalibration
+from rigwake.intrinsics.board_calibration import IntrinsicCalibration
 
 _CELLS_ALONG_WIDTH = 24
 

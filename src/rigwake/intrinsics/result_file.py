@@ -10,16 +10,16 @@ import numpy as np
 import yaml
 
 from rigwake.atomic import write_text_atomic
-from rigwake.cameras.catalogue import camera_to_dict
-from rigwake.cameras.files import HEADER
-from rigwake.intrinsics.calibrate import IntrinsicCalibration
+from rigwake.cameras.formats.camera_files import HEADER
+from rigwake.cameras.registry import camera_to_dict
+from rigwake.intrinsics.board_calibration import IntrinsicCalibration
 from rigwake.intrinsics.select import ModelScore
 
 
 def calibration_to_dict(
     result: IntrinsicCalibration, unused: Sequence[tuple[str, str]] = (), scores: Sequence[ModelScore] = ()
 ) -> dict[str, Any]:
-    """The camera, and under `calibration` how well it is known; null stands for what was not determined."""
+    """The camera, and under `calibration` how well it is known; null stands for what was unobservable."""
     calibration: dict[str, Any] = {
         "rms_px": round(result.rms_px, 6),
         "sigma_px": round(result.sigma_px, 6),
@@ -31,7 +31,7 @@ def calibration_to_dict(
         "max_observed_angle_deg": round(float(np.rad2deg(result.max_observed_angle)), 3),
         "std": {name: _finite(std) for name, std in result.stds.items()},
         "fixed": list(result.fixed),
-        "undetermined": list(result.undetermined),
+        "undetermined": list(result.unobservable),
         "converged": result.converged,
         "covariance": [[_finite(value) for value in row] for row in result.covariance.tolist()],
     }

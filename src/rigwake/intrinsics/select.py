@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigwake.cameras.base import CameraModel
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import EstimationError, RigwakeError
 from rigwake.geometry.se3 import stack
-from rigwake.intrinsics.adjust import Estimate, adjust, residuals
-from rigwake.intrinsics.calibrate import MIN_VIEWS, calibrate
-from rigwake.intrinsics.initialise import stacked, view_pose
-from rigwake.intrinsics.observations import BoardObservations
+from rigwake.intrinsics.board_adjustment import BoardEstimate, adjust, residuals
+from rigwake.intrinsics.board_calibration import MIN_VIEWS, calibrate
+from rigwake.intrinsics.board_observations import BoardObservations
+from rigwake.intrinsics.initial_guess import stacked, view_pose
 
 CANDIDATES = ("pinhole", "kb4", "eucm", "ds", "fov", "mei", "scaramuzza", "rational")
 _FOLDS = 5
@@ -95,7 +95,7 @@ def _held_out_errors(camera: CameraModel, observations: BoardObservations) -> li
     if not found:
         return errors
     corners = stacked(observations.take(found))
-    start = Estimate(camera, stack([pose for pose in poses if pose is not None]))
+    start = BoardEstimate(camera, stack([pose for pose in poses if pose is not None]))
     estimate, _ = adjust(start, corners, np.zeros(len(camera.params), dtype=np.bool_), sigma_px=1.0)
     r, valid = residuals(estimate, corners)
     squares = np.where(valid, (r**2).sum(axis=1), np.inf)

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rigwake.cameras.base import CameraModel
+from rigwake._types import Indices, Mask, Stamps
+from rigwake.cameras.protocol import CameraModel
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.triangulation import triangulate_rays
-from rigwake.odometry.observations import radians_per_pixel
+from rigwake.odometry.indexed_tracks import radians_per_pixel
 from rigwake.odometry.result import OdometryResult
 from rigwake.recording import GnssStream, ImuStream
 from rigwake.tracks import Tracks
 
-Stamps = NDArray[np.int64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 _GAP_INTERVALS = 3.5  # a gap is so many times the usual interval: single samples may be late
-_MOVING_SHARE = 0.02  # of the tracks of a map, which otherwise fit nearly all
+_MOVING_FRACTION = 0.02  # of the tracks of a map, which otherwise fit nearly all
 _MOVING_VIEWS = 5
 _MOVING_PX = 3.0
 
@@ -80,13 +77,13 @@ def _moving(tracks: Tracks, camera: CameraModel, visual: OdometryResult) -> list
     moving = _fits_nothing_standing(
         tracks, camera, path.world_from_body, rows[taken], at[taken], track[taken]
     )
-    share = moving.sum() / max(int(judged.sum()), 1)
-    if share < _MOVING_SHARE:
+    fraction = moving.sum() / max(int(judged.sum()), 1)
+    if fraction < _MOVING_FRACTION:
         return []
     frames = tracks.frame_indices[rows[taken][moving[np.unique(track[taken], return_inverse=True)[1]]]]
     first, last = np.percentile((tracks.timestamps_ns[frames] - tracks.timestamps_ns[0]) * 1e-9, [5, 95])
     return [
-        f"{moving.sum()} tracks ({100 * share:.0f} %) fit no standing point and were left out, mostly between "
+        f"{moving.sum()} tracks ({100 * fraction:.0f} %) fit no standing point and were left out, mostly between "
         f"{first:.1f} and {last:.1f} s: water, or something that moves"
     ]
 

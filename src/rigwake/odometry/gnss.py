@@ -7,19 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._types import Array
 from rigwake.errors import EstimationError, UnobservableError
 from rigwake.geometry import so3
 from rigwake.geometry.align import Alignment, align_points
 from rigwake.geometry.interpolate import interpolate
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.recording import GnssStream
 from rigwake.trajectory import Trajectory
 
 _ANTENNA_STD_M = 5.0  # prior: an antenna is on the same vessel as the camera
 CHI_SQUARE_3_999 = 16.27  # 99.9 % of a chi-square with three degrees of freedom
 CHI_SQUARE_3_MEDIAN = 2.37
-_DRIFT_SHARE = (
+_DRIFT_FRACTION = (
     0.005  # of the path: what the visual trajectory itself may be off; only gross errors are refused here
 )
 _MAX_GAP_S = 1.0  # fixes in a longer gap between poses are not used
@@ -66,7 +66,7 @@ def align_gnss(
     try:
         start = align_points(centres, fixes, "sim3")
     except EstimationError as cause:
-        raise _undetermined(trajectory.name) from cause
+        raise _unobservable(trajectory.name) from cause
     whitening = np.linalg.cholesky(np.linalg.inv(covariances))
     white_per_metre = np.linalg.norm(whitening, axis=(1, 2))
     x = _Fit(start, np.zeros(3) if antenna_cam is None else np.asarray(antenna_cam, dtype=np.float64))
@@ -80,7 +80,7 @@ def align_gnss(
         squares = (white**2).sum(axis=1)
         # while the fit is rough the gate follows the residuals
         spread = max(float(np.median(squares)) / CHI_SQUARE_3_MEDIAN, 1.0)
-        drift = _DRIFT_SHARE * x.alignment.scale * trajectory.path_length
+        drift = _DRIFT_FRACTION * x.alignment.scale * trajectory.path_length
         used = squares <= CHI_SQUARE_3_999 * spread + (white_per_metre * drift) ** 2
         WJ = np.einsum("nji,njk->nik", whitening, J)[used]
         information = np.einsum("nik,nil->kl", WJ, WJ)
@@ -95,7 +95,7 @@ def align_gnss(
     error, _ = x.linearise(centres, rotations, fixes)
     rms = float(np.sqrt(np.mean((error[used] ** 2).sum(axis=1))))
     if used.sum() < _MIN_FIXES or not np.sqrt(covariance[3, 3]) < 0.2 or x.alignment.scale <= 0:
-        raise _undetermined(trajectory.name)
+        raise _unobservable(trajectory.name)
     taking_part = np.zeros(len(gnss.timestamps_ns), dtype=bool)
     taking_part[index[used]] = True
     return GnssAlignment(x.alignment, x.antenna_cam, covariance, taking_part, int((~used).sum()), rms)
@@ -147,7 +147,7 @@ def _poses_at_fixes(
     return index, interpolate(stamps, trajectory.world_from_body, at[index])
 
 
-def _undetermined(name: str) -> UnobservableError:
+def _unobservable(name: str) -> UnobservableError:
     return UnobservableError(
         f"{name}: its path is too short or too straight for GNSS to tell scale and direction.",
         remedy="Sail a longer stretch with a turn.",

@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rigwake._types import Array, Stamps
 from rigwake.errors import UnobservableError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.recording import ImuStream
 from rigwake.sync import estimate_time_offset
 from rigwake.trajectory import Trajectory
 
-Stamps = NDArray[np.int64]
 _MAX_STEP_S = 1.0  # a camera motion over a longer time is not compared with the gyro: its bias would count
 _MAX_ROTATION_STD = np.deg2rad(10.0)
 
@@ -33,9 +31,9 @@ class TurnedImu:
             np.searchsorted(self.timestamps_ns, at_ns, side="right") - 1, 0, len(self.rotation) - 2
         )
         span = (self.timestamps_ns[before + 1] - self.timestamps_ns[before]).astype(np.float64)
-        share = (at_ns - self.timestamps_ns[before]) / span
+        fraction = (at_ns - self.timestamps_ns[before]) / span
         step = so3.log(np.swapaxes(self.rotation[before], 1, 2) @ self.rotation[before + 1])
-        return np.asarray(self.rotation[before] @ so3.exp(step * share[:, None]))
+        return np.asarray(self.rotation[before] @ so3.exp(step * fraction[:, None]))
 
 
 def integrate_gyro(imu: ImuStream, gyro_bias: Array | None = None) -> TurnedImu:
@@ -69,10 +67,10 @@ class GyroAlignment:
 def align_gyro(
     trajectory: Trajectory, imu: ImuStream, *, time_offset_s: float | None = None
 ) -> GyroAlignment:
-    """Rotation, clock offset and gyro bias from the turns that both saw: needs no scale and no position.
+    """Rotation, time offset and gyro bias from the turns that both saw: needs no scale and no position.
 
     Minimises `log(dR_imu^T X dR_cam X^T)` over the camera's motions (Cauchy loss), where `dR_imu` is the gyro
-    integrated between the same two times. time_offset_s: first guess; by correlating angular speeds if None.
+    integrated between the same two times. time_offset_s: initial guess; by correlating angular speeds if None.
     Raises UnobservableError if the camera turned about one axis only, or too little.
     """
     turned = integrate_gyro(imu)
@@ -81,20 +79,20 @@ def align_gyro(
         time_offset_s = estimate_time_offset(
             Trajectory(imu.name, imu.timestamps_ns, still), trajectory
         ).offset_s
-    starts, ends, camera_turn = _camera_turns(trajectory, imu, time_offset_s)
+    starts, ends, camera_rotation = _camera_rotations(trajectory, imu, time_offset_s)
     durations = ((ends - starts) * 1e-9)[:, None]
 
     def residuals(X: Array, bias: Array, offset_s: float) -> Array:
         shift = round(offset_s * 1e9)
-        gyro_turn = np.swapaxes(turned.at(starts + shift), 1, 2) @ turned.at(ends + shift)
-        gyro_turn = gyro_turn @ so3.exp(-bias * durations)
-        return so3.log(np.swapaxes(gyro_turn, 1, 2) @ X @ camera_turn @ X.T)
+        gyro_rotation = np.swapaxes(turned.at(starts + shift), 1, 2) @ turned.at(ends + shift)
+        gyro_rotation = gyro_rotation @ so3.exp(-bias * durations)
+        return so3.log(np.swapaxes(gyro_rotation, 1, 2) @ X @ camera_rotation @ X.T)
 
     first = so3.log(
         np.swapaxes(turned.at(starts + round(time_offset_s * 1e9)), 1, 2)
         @ turned.at(ends + round(time_offset_s * 1e9))
     )
-    X = _wahba(so3.log(camera_turn), first)
+    X = _wahba(so3.log(camera_rotation), first)
     bias, offset_s = np.zeros(3), time_offset_s
     information, rms = np.zeros((7, 7)), np.inf
     for _ in range(10):
@@ -110,11 +108,13 @@ def align_gyro(
         if np.abs(step).max() < 1e-7:
             break
     covariance = np.asarray(np.linalg.pinv(information, hermitian=True)) * rms**2
-    _require_turns(information, rms, trajectory.name)
+    _require_rotation(information, rms, trajectory.name)
     return GyroAlignment(X, offset_s, bias, covariance, float(np.rad2deg(rms)))
 
 
-def _camera_turns(trajectory: Trajectory, imu: ImuStream, offset_s: float) -> tuple[Stamps, Stamps, Array]:
+def _camera_rotations(
+    trajectory: Trajectory, imu: ImuStream, offset_s: float
+) -> tuple[Stamps, Stamps, Array]:
     """Starts, ends (camera clock) and rotations between neighbouring poses of one segment inside the IMU's span."""
     stamps, R = trajectory.timestamps_ns, trajectory.world_from_body.rotation
     assert trajectory.segment_ids is not None
@@ -137,13 +137,13 @@ def _camera_turns(trajectory: Trajectory, imu: ImuStream, offset_s: float) -> tu
     return stamps[:-1][usable], stamps[1:][usable], turns[usable]
 
 
-def _wahba(turns_cam: Array, turns_imu: Array) -> Array:
+def _wahba(rotations_cam: Array, rotations_imu: Array) -> Array:
     """The rotation `imu_from_cam` that best maps rotation vectors onto rotation vectors, robustly."""
-    weights = np.ones(len(turns_cam))
+    weights = np.ones(len(rotations_cam))
     X = np.eye(3)
     for _ in range(5):
-        X = so3.nearest_rotation((turns_imu * weights[:, None]).T @ turns_cam)
-        size = np.linalg.norm(turns_cam @ X.T - turns_imu, axis=1)
+        X = so3.nearest_rotation((rotations_imu * weights[:, None]).T @ rotations_cam)
+        size = np.linalg.norm(rotations_cam @ X.T - rotations_imu, axis=1)
         weights = 1 / (1 + (size / max(float(np.median(size)), 1e-9)) ** 2)
     return X
 
@@ -162,7 +162,7 @@ def _jacobian(residuals, X: Array, bias: Array, offset_s: float) -> Array:  # ty
     return np.stack(columns, axis=-1)
 
 
-def _require_turns(information: Array, rms: float, name: str) -> None:
+def _require_rotation(information: Array, rms: float, name: str) -> None:
     eigenvalues = np.linalg.eigvalsh(information[:3, :3])
     worst = rms / np.sqrt(max(float(eigenvalues[0]), 1e-300))
     if worst > _MAX_ROTATION_STD:

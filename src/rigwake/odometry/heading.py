@@ -15,7 +15,7 @@ from rigwake.recording import AttitudeStream
 
 
 def headed(start: MetricStart, attitude: AttitudeStream) -> MetricStart:
-    """First values in a level world, turned about the vertical so that x is east as the attitude says.
+    """Initial values in a level world, turned about the vertical so that x is east as the attitude says.
 
     attitude: `world_from_body` of the IMU's axes, on its clock. The turn is the circular mean of the differences.
     Raises UnobservableError if attitude and path share no time.

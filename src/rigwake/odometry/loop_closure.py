@@ -16,18 +16,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.cameras.base import CameraModel
+from rigwake._types import Array, Indices
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import EstimationError
 from rigwake.geometry.pnp import absolute_pose
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
-from rigwake.odometry.observations import radians_per_pixel
+from rigwake.odometry.indexed_tracks import radians_per_pixel
 from rigwake.odometry.pose_graph import Edges, Similarities, optimise_pose_graph
 from rigwake.odometry.result import OdometryResult
 from rigwake.recording import CameraStream
 from rigwake.tracks import Tracks
 
-Indices = NDArray[np.int64]
 # what odometry may be wrong by from frame to frame, and a recognised place: rotation, share of length, log of scale
 _STEP_STD = (1e-3, 0.01, 3e-3)
 _LOOP_STD = (2e-3, 2e-3, 0.02)
@@ -167,7 +166,7 @@ def closed_path(visual: OdometryResult, loops: Loops) -> tuple[Indices, SE3]:
 
 
 def _edge_std(relative: tuple[float, float, float], lengths: Array) -> Array:
-    """(E, 7) of edges: radians, a share of the length, and the log of scale."""
+    """(E, 7) of edges: radians, a fraction of the length, and the log of scale."""
     rotation, translation, scale = relative
     columns = np.repeat([rotation, 0.0, scale], [3, 3, 1]) * np.ones((len(lengths), 1))
     columns[:, 3:6] = translation * lengths[:, None]

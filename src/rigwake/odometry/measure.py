@@ -8,16 +8,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from rigwake._types import Array
 from rigwake.errors import EstimationError, UnobservableError
-from rigwake.geometry.so3 import Array
+from rigwake.odometry.gravity_alignment import up_in_camera
 from rigwake.odometry.gyro import GyroAlignment, align_gyro, camera_rotations
-from rigwake.odometry.level import up_in_camera
 from rigwake.recording import CameraStream, ImuStream
+from rigwake.tracking.camera_rotations import visual_rotations
 from rigwake.tracking.front_ends import track_camera
-from rigwake.tracking.hull import find_hull
 from rigwake.tracking.masks import CameraMask, lens_mask, mask_from_file
-from rigwake.tracking.options import TrackingOptions
-from rigwake.tracking.turns import visual_turns
+from rigwake.tracking.self_mask import find_self_mask
+from rigwake.tracking.tracking_options import TrackingOptions
 from rigwake.tracks import Tracks
 
 Progress = Callable[[str, int, int], None]
@@ -85,7 +85,7 @@ def _mask(stream: CameraStream, hull: bool, mask_file: Path | None, notes: list[
         mask = mask.with_region("file", ~given.usable)
     if hull:
         try:
-            mask = mask.with_region("hull", find_hull(stream, mask.usable))
+            mask = mask.with_region("hull", find_self_mask(stream, mask.usable))
         except (UnobservableError, EstimationError) as error:
             notes.append(f"own hull not looked for: {error.cause}")
     return mask
@@ -96,6 +96,6 @@ def _gyro(stream: CameraStream, imu: ImuStream | None) -> tuple[GyroAlignment | 
     if imu is None:
         return None, []
     try:
-        return align_gyro(visual_turns(stream), imu), []
+        return align_gyro(visual_rotations(stream), imu), []
     except (UnobservableError, EstimationError) as error:
         return None, [f"tracking is not aided by the gyroscope: {error.cause}"]

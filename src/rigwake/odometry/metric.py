@@ -1,4 +1,4 @@
-"""From one camera's motion up to scale to metres: first values from GNSS and IMU for a camera and for its rig."""
+"""From one camera's motion up to scale to metres: initial values from GNSS and IMU for a camera and for its rig."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from typing import Literal
 
 import numpy as np
 
+from rigwake._types import Array
 from rigwake.errors import UnobservableError, UsageError
 from rigwake.geometry import so3
 from rigwake.geometry.align import Alignment
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.odometry.gnss import GnssAlignment, align_gnss
 from rigwake.odometry.gyro import GyroAlignment, align_gyro
-from rigwake.odometry.inertial import InertialAlignment, align_inertial
+from rigwake.odometry.imu_alignment import InertialAlignment, align_inertial
 from rigwake.recording import GnssStream, ImuStream
 from rigwake.trajectory import Trajectory
 
 _UP = np.array([0.0, 0.0, 1.0])
-_ALIGNED_STD = np.deg2rad(1.0)  # floor of what is promised for a first value
+_ALIGNED_STD = np.deg2rad(1.0)  # floor of what is assumed for a first value
 
 
 @dataclass(frozen=True, eq=False)
 class MetricStart:
-    """First values of a camera and the rig it sits on, good enough to start an adjustment.
+    """Initial values of a camera and the rig it sits on, good enough to start an adjustment.
 
     world_from_cam: metric, camera clock. world: `enu` (GNSS), or `level` (IMU alone: z up, heading arbitrary).
     scale_source: which sensor gave metres. rig_from_cam: rig axes and origin are the IMU's; identity without one.
@@ -66,11 +66,11 @@ def metric_start(
     *,
     time_offset_s: float | None = None,
 ) -> MetricStart:
-    """Scale, world, mounting, lever arms, clock offset and biases from one camera's visual trajectory.
+    """Scale, world, mounting, lever arms, time offset and biases from one camera's visual trajectory.
 
     trajectory: `world_from_cam` up to scale, with segments. The gyroscope gives rotation and clock; GNSS the scale,
     the world and the antenna; the accelerometer the lever arm, its bias and, without GNSS, scale and gravity.
-    imu: its axes are those of the rig. time_offset_s: known clock offset of the camera, else estimated.
+    imu: its axes are those of the rig. time_offset_s: known time offset of the camera, else estimated.
 
     Raises UsageError without IMU and GNSS; UnobservableError if neither determines the scale.
     """

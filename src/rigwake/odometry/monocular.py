@@ -7,23 +7,21 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rigwake.cameras.base import CameraModel
+from rigwake._types import Array, Indices
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import EstimationError
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.geometry.two_view import rotation_compensated_parallax
-from rigwake.odometry.adjust import adjust_all, adjust_window
-from rigwake.odometry.initialise import choose_start, start_points
-from rigwake.odometry.observations import index_observations
-from rigwake.odometry.options import OdometryOptions
+from rigwake.odometry.indexed_tracks import index_observations
+from rigwake.odometry.map_adjustment import adjust_all, adjust_window
+from rigwake.odometry.odometry_options import OdometryOptions
 from rigwake.odometry.result import OdometryCounts, OdometryLandmarks, OdometryResult
+from rigwake.odometry.start_pair import choose_start, start_points
 from rigwake.odometry.visual_map import VisualMap
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
-Indices = NDArray[np.int64]
 Progress = Callable[[int], None]
 _MIN_SEGMENT = 5  # frames
 _WIDE = 4.0  # times the gate, where poses are only nearly right
@@ -220,7 +218,7 @@ class _Builder:
             return True
         before = len(self.map.known_rows(last_keyframe, segment))
         now = len(self.map.known_rows(frame, segment))
-        if now < self.options.keyframe_share * before:
+        if now < self.options.keyframe_fraction * before:
             return True
         a, b = observations.common(last_keyframe, frame)
         if len(a) < self.options.min_inliers:

@@ -17,12 +17,11 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
+from rigwake._types import Array, Indices
 from rigwake.errors import EstimationError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 
-Indices = NDArray[np.int64]
 _MAX_STEPS = 50
 _CONVERGED = 1e-9
 _ROBUST_STDS = 3.0

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array, Indices
 from rigwake.trajectory import Trajectory
-
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

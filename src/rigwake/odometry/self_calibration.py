@@ -15,9 +15,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rigwake.bundle.problem import (
+from rigwake.ba.solver.levenberg_marquardt import solve
+from rigwake.ba.solver.rig_problem import (
     BundleCamera,
     DistanceMeasurement,
     Landmarks,
@@ -27,14 +27,12 @@ from rigwake.bundle.problem import (
     States,
     VectorPrior,
 )
-from rigwake.bundle.solver import solve
-from rigwake.cameras.base import CameraModel
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import RigwakeError
 from rigwake.geometry.se3 import SE3
 from rigwake.odometry.result import OdometryResult
 from rigwake.tracks import Tracks
 
-Indices = NDArray[np.int64]
 _FOCAL = frozenset({"fx", "fy", "f", "a0"})
 _PRIOR_PX = 1.0  # each parameter alone is believed to be so right, over the pixels that were observed
 _MAX_FRAMES = 150
@@ -53,7 +51,7 @@ class RefinedLens:
     """A lens that explains the tracks better than the one given.
 
     tracks: the given ones, with bearings by this lens. shift_px: root mean square by which it moves what was
-    observed. gain: share of the adjustment's cost that it took away.
+    observed. gain: fraction of the bundle adjustment's cost that it took away.
     """
 
     camera: CameraModel
@@ -93,7 +91,7 @@ def refine_lens(
 ) -> RefinedLens | None:
     """Distortion and principal point estimated with motion and points of the longest segment.
 
-    None where that lowers the adjustment's cost by less than `min_gain`, or where it cannot be estimated.
+    None where that lowers the bundle adjustment's cost by less than `min_gain`, or where it cannot be estimated.
     Every free parameter has a prior about the lens `believed` (`camera`, unless given): alone, it moves the observed
     pixels by one (root mean square).
     """

@@ -8,12 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rigwake.bundle.covariance import covariance_of
-from rigwake.bundle.layout import layout_of
-from rigwake.bundle.motion import nearest_states, rig_at, seconds_since_start
-from rigwake.bundle.problem import (
+from rigwake._types import Array, Indices
+from rigwake.ba.solver.covariance import covariance_of
+from rigwake.ba.solver.levenberg_marquardt import solve
+from rigwake.ba.solver.parameter_layout import layout_of
+from rigwake.ba.solver.rig_problem import (
     Antenna,
     BundleCamera,
     InertialStates,
@@ -25,24 +25,22 @@ from rigwake.bundle.problem import (
     SolverOptions,
     States,
 )
-from rigwake.bundle.robust import MAD_TO_STD
-from rigwake.bundle.solver import solve
-from rigwake.cameras.base import CameraModel
+from rigwake.ba.solver.robust_loss import MAD_TO_STD
+from rigwake.ba.solver.state_motion import nearest_states, rig_at, seconds_since_start
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import EstimationError
 from rigwake.geometry.interpolate import TransformSpline
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.geometry.triangulation import triangulate_rays
 from rigwake.odometry.gnss import CHI_SQUARE_3_999, CHI_SQUARE_3_MEDIAN
 from rigwake.odometry.heading import headed
-from rigwake.odometry.inertial import with_noise
+from rigwake.odometry.imu_alignment import with_noise
 from rigwake.odometry.metric import MetricStart
 from rigwake.odometry.result import OdometryResult
 from rigwake.recording import AttitudeStream, GnssStream, ImuStream
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
-Indices = NDArray[np.int64]
 _STATE_INTERVAL_S = 0.25  # the IMU carries the motion between states
 _EDGE_NS = (
     20_000_000  # a frame this much outside the IMU's samples still becomes a state: the nearest sample serves
@@ -63,7 +61,7 @@ class SmoothedOdometry:
 
     trajectory: `world_from_cam`, camera clock, of every frame in the time of the states, with covariances of the
     poses (those of the nearest state). rig_from_cam, time_offset_s, gyro_bias, accel_bias (mean over the
-    recording), antenna_rig: at the optimum. noise_factor: how much larger residuals are than the tracks promised.
+    recording), antenna_rig: at the optimum. noise_factor: how much larger residuals are than the tracks assumed.
     gnss_gated: fixes that the smoothed path refused. bridged: frames without a visual pose that the IMU carried
     over. solution: the adjusted problem.
     """
@@ -89,15 +87,15 @@ def smooth(
     gnss: GnssStream | None = None,
     attitude: AttitudeStream | None = None,
 ) -> SmoothedOdometry:
-    """Adjust states, landmarks, mounting, clock offset and biases of a single-camera rig together.
+    """Adjust states, landmarks, mounting, time offset and biases of a single-camera rig together.
 
     start: from `metric_start` of the same streams. attitude: of the IMU's axes; gives the world its heading, and holds
     it, where GNSS does not (see `heading.py`). Observations: inliers of the visual odometry at the states'
-    frames. With an IMU there are four states per second and the camera's `rig_from_cam` and clock offset are free;
+    frames. With an IMU there are four states per second and the camera's `rig_from_cam` and time offset are free;
     without, a state per frame and the rig is the camera. Two rounds, between which outliers go and the noise of
     the pixels is set to what the residuals show.
 
-    Raises EstimationError if too few landmarks are seen or the adjustment does not succeed.
+    Raises EstimationError if too few landmarks are seen or the bundle adjustment does not succeed.
     """
     noisy_imu = with_noise(imu) if imu is not None else None
     if gnss is not None or imu is None:
@@ -278,7 +276,7 @@ def _every_frame(tracks: Tracks, visual: OdometryResult, solution: RigSolution) 
     problem = solution.problem
     seen_by = problem.cameras[0]
     on_rig = tracks.timestamps_ns + round(seen_by.time_offset_s * 1e9)
-    slack = 1_000_000  # the clock offset has moved a little since states were put on frames
+    slack = 1_000_000  # the time offset has moved a little since states were put on frames
     states_ns = problem.states.timestamps_ns
     inside = (on_rig >= states_ns[0] - slack) & (on_rig <= states_ns[-1] + slack)
     if problem.imu is None:  # nothing carries the motion between states

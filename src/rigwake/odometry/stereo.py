@@ -13,22 +13,28 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.bundle.problem import BundleCamera, Landmarks, Observations, RigProblem, SolverOptions, States
-from rigwake.bundle.solver import solve
+from rigwake._types import Array, Image
+from rigwake.ba.solver.levenberg_marquardt import solve
+from rigwake.ba.solver.rig_problem import (
+    BundleCamera,
+    Landmarks,
+    Observations,
+    RigProblem,
+    SolverOptions,
+    States,
+)
 from rigwake.errors import EstimationError, UsageError
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.geometry.triangulation import triangulate_rays
 from rigwake.geometry.two_view import sampson_angles
-from rigwake.odometry.observations import index_observations, radians_per_pixel
-from rigwake.odometry.options import OdometryOptions
+from rigwake.odometry.indexed_tracks import index_observations, radians_per_pixel
+from rigwake.odometry.odometry_options import OdometryOptions
 from rigwake.odometry.visual_map import VisualMap
-from rigwake.recording import CameraStream, Image
+from rigwake.recording import CameraStream
 from rigwake.tracking.klt import follow, pyramid
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
-Indices = NDArray[np.int64]
 _STD_PX = 0.3  # of a match between the two cameras, which is not registered as finely as a track
 _WINDOW_PX, _LEVELS = 21, 4  # of the search
 _CHAIN_STD_PX = 0.5
@@ -129,7 +135,7 @@ def estimate_stereo(
     order = np.lexsort((tracks.track_ids, tracks.frame_indices))
     tracks = tracks.take(order)
     matches = match_stereo(tracks, first, second, second_from_first)
-    # until the adjustment, points are as uncertain as their disparity, and pixels must not be trusted beyond that
+    # until the bundle adjustment, points are as uncertain as their disparity, and pixels must not be trusted beyond that
     loose = replace(tracks, std_px=np.maximum(tracks.std_px, _CHAIN_STD_PX))
     visual_map = VisualMap(index_observations(loose, first.model), options)
     _chain(visual_map, matches, second_from_first)

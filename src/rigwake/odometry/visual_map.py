@@ -6,19 +6,15 @@ This is the one mutable object of visual odometry; only `monocular` and `adjust`
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rigwake._types import Array, Indices, Mask
 from rigwake.errors import EstimationError
 from rigwake.geometry.pnp import AbsolutePose, absolute_pose, bearing_angles, refined
 from rigwake.geometry.ransac import Budget
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.geometry.triangulation import triangulate_rays
-from rigwake.odometry.observations import Observations
-from rigwake.odometry.options import OdometryOptions
-
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from rigwake.odometry.indexed_tracks import IndexedTracks
+from rigwake.odometry.odometry_options import OdometryOptions
 
 
 class VisualMap:
@@ -29,7 +25,7 @@ class VisualMap:
     points: (T, 3), NaN where a track has none; point_segment: (T,). inlier: (M,) observations that agree.
     """
 
-    def __init__(self, observations: Observations, options: OdometryOptions) -> None:
+    def __init__(self, observations: IndexedTracks, options: OdometryOptions) -> None:
         self.observations = observations
         self.options = options
         frames, tracks = observations.frames, len(observations.track_ids)
@@ -87,8 +83,8 @@ class VisualMap:
         if pose is None:
             return None
         enough = pose.inliers.sum() >= self.options.min_inliers
-        share = pose.inliers.mean() >= self.options.min_inlier_share
-        return (pose, rows) if enough and share else None
+        fraction = pose.inliers.mean() >= self.options.min_inlier_fraction
+        return (pose, rows) if enough and fraction else None
 
     def triangulate(self, segment: int, tracks: Indices, *, keyframes_only: bool) -> None:
         """(Re-)triangulate these tracks from the placed frames of the segment, or its keyframes alone.

@@ -17,10 +17,10 @@ from rigwake.errors import RigwakeError
 from rigwake.odometry.measure import measure_camera
 from rigwake.odometry.monocular import estimate_monocular
 from rigwake.recording import CameraStream, ImuStream
-from rigwake.writers.trajectories import write_tum
+from rigwake.writers.trajectory_writer import write_tum
 
-Tell = Callable[[str, float], None]
-"""Told what is being done and which share of it is done."""
+StageProgress = Callable[[str, float], None]
+"""Told what is being done and which fraction of it is done."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +67,12 @@ def load_outcome(out: Path, camera: str) -> CameraOutcome:
     return CameraOutcome(**{**content, "notes": tuple(content["notes"])})
 
 
-def process_camera(job: CameraJob, tell: Tell) -> CameraOutcome:
+def process_camera(job: CameraJob, report_stage: StageProgress) -> CameraOutcome:
     """Mask, turns, tracks and odometry of one camera; a camera that fails is an outcome, not an exception."""
     cv2.setNumThreads(1)
     started, name = time.perf_counter(), job.stream.name
     try:
-        outcome = _process(job, tell)
+        outcome = _process(job, report_stage)
     except RigwakeError as error:
         outcome = CameraOutcome(name, str(error), unobservable=error.exit_code == 3)
     outcome = replace(outcome, seconds=time.perf_counter() - started)
@@ -80,14 +80,14 @@ def process_camera(job: CameraJob, tell: Tell) -> CameraOutcome:
     return outcome
 
 
-def _process(job: CameraJob, tell: Tell) -> CameraOutcome:
+def _process(job: CameraJob, report_stage: StageProgress) -> CameraOutcome:
     stream, config = job.stream, job.config
     assert stream.model is not None
 
     def progress(stage: str, done: int, total: int) -> None:
-        tell(stage, done / max(total, 1))
+        report_stage(stage, done / max(total, 1))
 
-    measured = measure_camera(stream, job.imu, config.tracking, progress, hull=config.find_hull)
+    measured = measure_camera(stream, job.imu, config.tracking, progress, hull=config.find_self_mask)
     measured.mask.save(job.out / "masks", stream.name)
     tracks = measured.tracks
     tracks.save(tracks_file(job.out, stream.name))

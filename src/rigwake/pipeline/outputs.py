@@ -10,39 +10,39 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rigwake.adjustment.hand_over import HandOver
-from rigwake.adjustment.proposals import camera_from_world
-from rigwake.adjustment.start import FirstRig
-from rigwake.adjustment.values import AdjustedRig
+from rigwake._types import Array, Image
 from rigwake.atomic import atomic_path, write_text_atomic
-from rigwake.bundle.problem import RigProblem
+from rigwake.ba.rig.association_rounds import CrossCameraMatches
+from rigwake.ba.rig.initialisation import InitialRig
+from rigwake.ba.rig.rig_values import AdjustedRig
+from rigwake.ba.rig.search_proposals import camera_from_world
+from rigwake.ba.solver.rig_problem import RigProblem
 from rigwake.calibration import Calibration, save_calibration
-from rigwake.cameras.base import CameraModel
-from rigwake.geometry.so3 import Array
-from rigwake.pipeline.selection import Selection
-from rigwake.recording import CameraStream, Image
+from rigwake.cameras.protocol import CameraModel
+from rigwake.pipeline.stream_selection import Selection
+from rigwake.recording import CameraStream
 from rigwake.trajectory import Trajectory
-from rigwake.writers.trajectories import write_tum
+from rigwake.writers.trajectory_writer import write_tum
 
 _MOST_RESIDUALS = 200_000
 _HORIZON_PICTURES = 3  # per camera
-_HAND_OVER_PICTURES = 2  # per camera
+_ASSOCIATION_PICTURES = 2  # per camera
 
 
 def write_outputs(
     out: Path,
     calibration: Calibration,
     adjusted: AdjustedRig,
-    first: FirstRig,
+    first: InitialRig,
     selection: Selection,
-    handed_over: HandOver,
+    matches: CrossCameraMatches,
 ) -> None:
     """Trajectories, residuals, pictures and, last, the calibration itself."""
     problem = adjusted.solution.problem
     _write_trajectories(out / "trajectories", problem, selection)
     _write_residuals(out / "residuals.npz", adjusted)
     is_level = problem.imu is not None or problem.gnss is not None
-    _write_pictures(out / "pictures", problem, selection.cameras, handed_over, is_level)
+    _write_pictures(out / "pictures", problem, selection.cameras, matches, is_level)
     save_calibration(calibration, out / "calibration.yaml")
 
 
@@ -81,10 +81,10 @@ def _write_pictures(
     folder: Path,
     problem: RigProblem,
     streams: Mapping[str, CameraStream],
-    handed_over: HandOver,
+    matches: CrossCameraMatches,
     is_level: bool,
 ) -> None:
-    """Some images of every camera with the horizon, and with landmarks handed over from other cameras."""
+    """Some images of every camera with the horizon, and with landmarks associated across cameras from other cameras."""
     entries: list[dict[str, Any]] = []
     for index, camera in enumerate(problem.cameras):
         stream = streams[camera.name]
@@ -94,8 +94,8 @@ def _write_pictures(
                 horizon = horizon_pixels(camera.model, cam_from_world.rotation[:, 2])
                 entry = {"kind": "horizon", "horizon_px": horizon.round(1).tolist(), "points": []}
                 entries += _save_picture(folder, stream, stamp, len(entries), entry)
-        for stamp, rows in _busiest_images(handed_over, index):
-            points = _hand_over_points(problem, handed_over, index, stamp, rows)
+        for stamp, rows in _busiest_images(matches, index):
+            points = _association_points(problem, matches, index, stamp, rows)
             entry = {"kind": "hand_over", "horizon_px": [], "points": points}
             entries += _save_picture(folder, stream, stamp, len(entries), entry)
     write_text_atomic(folder / "pictures.json", json.dumps(_without_nan(entries)) + "\n")
@@ -109,18 +109,18 @@ def _spread_stamps(problem: RigProblem, camera: int) -> list[int]:
     return [int(s) for s in np.unique(stamps[at])]
 
 
-def _busiest_images(handed_over: HandOver, camera: int) -> list[tuple[int, Any]]:
-    unused = handed_over.unused
+def _busiest_images(matches: CrossCameraMatches, camera: int) -> list[tuple[int, Any]]:
+    unused = matches.unused
     rows = np.flatnonzero(unused.camera_indices == camera)
     stamps, counts = np.unique(unused.timestamps_ns[rows], return_counts=True)
-    busiest = stamps[np.argsort(-counts, kind="stable")[:_HAND_OVER_PICTURES]]
+    busiest = stamps[np.argsort(-counts, kind="stable")[:_ASSOCIATION_PICTURES]]
     return [(int(stamp), rows[unused.timestamps_ns[rows] == stamp]) for stamp in busiest]
 
 
-def _hand_over_points(
-    problem: RigProblem, handed_over: HandOver, camera: int, stamp: int, rows: Any
+def _association_points(
+    problem: RigProblem, matches: CrossCameraMatches, camera: int, stamp: int, rows: Any
 ) -> list[dict[str, Any]]:
-    unused, seen = handed_over.unused, problem.observations
+    unused, seen = matches.unused, problem.observations
     landmarks = unused.landmark_indices[rows]
     cam_from_world = camera_from_world(problem, camera, np.array([stamp]))[0]
     predicted, _ = problem.cameras[camera].model.project(

@@ -1,4 +1,4 @@
-"""What is known of a rig beforehand: tape measures with their doubt, fixed degrees of freedom, known baselines.
+"""What is known of a rig beforehand: tape measures with their uncertainty, fixed degrees of freedom, known baselines.
 
 cameras:
   front:
@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from rigwake.adjustment.gauge import with_gauge
-from rigwake.adjustment.start import FirstRig
-from rigwake.bundle.problem import (
+from rigwake._types import Array
+from rigwake.ba.rig.gauge import with_gauge
+from rigwake.ba.rig.initialisation import InitialRig
+from rigwake.ba.solver.rig_problem import (
     BundleCamera,
     CameraDistance,
     CameraParameter,
@@ -31,8 +32,7 @@ from rigwake.bundle.problem import (
 from rigwake.config import CalibrateConfig
 from rigwake.errors import InputError, UsageError
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
-from rigwake.readers.truth import read_yaml_mapping
+from rigwake.readers.truth_files import read_yaml_mapping
 from rigwake.trajectory import Trajectory
 
 # as good as nothing, yet it keeps an offset that nothing determines, and whatever it draws along, from running away
@@ -58,8 +58,8 @@ class RigPrior:
     baselines: tuple[Baseline, ...] = ()
     antenna: VectorPrior | None = None
 
-    def applied_to(self, first: FirstRig, config: CalibrateConfig) -> FirstRig:
-        """First values with these priors, with the scale of a known baseline if there is no other, and with what
+    def applied_to(self, first: InitialRig, config: CalibrateConfig) -> InitialRig:
+        """Initial values with these priors, with the scale of a known baseline if there is no other, and with what
         the settings hold fixed. Raises UsageError for cameras that are not there."""
         cameras = dict(first.start.cameras)
         for name in self.cameras:
@@ -112,7 +112,7 @@ def _aboard(camera: BundleCamera) -> PosePrior | None:
     return PosePrior.in_axes_of_a(mean, np.repeat([np.inf, _ABOARD_STD_M], 3))
 
 
-def _scaled(first: FirstRig, baselines: tuple[Baseline, ...]) -> FirstRig:
+def _scaled(first: InitialRig, baselines: tuple[Baseline, ...]) -> InitialRig:
     """Everything in metres, by the ratio of the known to the estimated baselines."""
     cameras, ratios = first.start.cameras, []
     for baseline in baselines:

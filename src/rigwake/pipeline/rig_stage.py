@@ -1,4 +1,4 @@
-"""The rig from every camera's trajectory and tracks: first values, adjustment, checks."""
+"""The rig from every camera's trajectory and tracks: initial values, adjustment, checks."""
 
 from __future__ import annotations
 
@@ -6,52 +6,52 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rigwake.adjustment.assemble import assemble_problem
-from rigwake.adjustment.checks import (
-    hand_over_errors,
+from rigwake.ba.rig.assemble_problem import assemble_problem
+from rigwake.ba.rig.association_rounds import CrossCameraMatches, adjust_with_association
+from rigwake.ba.rig.imu_noise import imu_noise_factors
+from rigwake.ba.rig.initialisation import InitialRig, initial_rig
+from rigwake.ba.rig.outlier_rounds import adjust
+from rigwake.ba.rig.rig_values import AdjustedRig, RigMeasurements
+from rigwake.ba.rig.rig_verdicts import ReferenceFrame, calibrated_cameras
+from rigwake.ba.rig.split_checks import (
+    association_errors,
     residual_statistics,
     split_half,
     split_half_summary,
 )
-from rigwake.adjustment.hand_over import HandOver, adjust_with_hand_over
-from rigwake.adjustment.imu_noise import imu_noise_factors
-from rigwake.adjustment.rounds import adjust
-from rigwake.adjustment.start import FirstRig, first_rig
-from rigwake.adjustment.values import AdjustedRig, RigMeasurements
-from rigwake.adjustment.verdicts import ReferenceFrame, calibrated_cameras
-from rigwake.bundle.covariance import covariance_of
+from rigwake.ba.solver.covariance import covariance_of
 from rigwake.calibration import Calibration
 from rigwake.config import CalibrateConfig
 from rigwake.errors import InputError, UnobservableError
 from rigwake.geometry.se3 import SE3
 from rigwake.pipeline.prior import RigPrior
-from rigwake.pipeline.selection import Selection
+from rigwake.pipeline.stream_selection import Selection
 from rigwake.recording import Recording
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
-Tell = Callable[[str, float], None]
-"""Told what is being done and which share of it is done."""
+StageProgress = Callable[[str, float], None]
+"""Told what is being done and which fraction of it is done."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigEstimate:
-    """The rig, and what the adjustment and the hand-over left."""
+    """The rig, and what the bundle adjustment and the cross-camera association left."""
 
     calibration: Calibration
     adjusted: AdjustedRig
-    handed_over: HandOver
+    matches: CrossCameraMatches
 
 
-def start_rig(
+def initialise_rig(
     selection: Selection, trajectories: Mapping[str, Trajectory], config: CalibrateConfig, prior: RigPrior
-) -> FirstRig:
-    """First values from every camera's own motion (by camera, up to scale or metric) and what is known beforehand.
+) -> InitialRig:
+    """Initial values from every camera's own motion (by camera, up to scale or metric) and what is known beforehand.
 
     Raises UsageError for a prior that names what is not there, UnobservableError when the motion determines nothing.
     """
     models = {name: selection.cameras[name].model for name in trajectories}
-    first = first_rig(
+    first = initial_rig(
         trajectories,
         {name: model for name, model in models.items() if model is not None},
         selection.imu,
@@ -64,17 +64,17 @@ def estimate_rig(
     recording: Recording,
     selection: Selection,
     tracks: Mapping[str, Tracks],
-    first: FirstRig,
+    first: InitialRig,
     config: CalibrateConfig,
     prior: RigPrior,
     *,
     masks: Path,
-    tell: Tell = lambda words, share: None,
+    progress: StageProgress = lambda words, fraction: None,
 ) -> RigEstimate:
-    """The rig from first values and what was tracked.
+    """The rig from initial values and what was tracked.
 
     tracks: by camera, of all that `first` knows. prior: the one that `first` was made with. masks: folder of the
-    cameras' masks, for landmarks that are handed over. Images are only read with `config.adjustment.cross_camera`.
+    cameras' masks, for landmarks that are associated across cameras. Images are only read with `config.adjustment.cross_camera`.
 
     Raises UsageError for a reference that is not there, UnobservableError when the motion
     determines nothing, EstimationError when no trustworthy answer was found.
@@ -82,46 +82,46 @@ def estimate_rig(
     measurements = RigMeasurements(
         {name: tracks[name] for name in first.start.cameras}, selection.imu, selection.gnss
     )
-    adjusted, handed_over = _adjust(measurements, first, prior, selection, config, masks, tell)
-    tell("checking", 0.8)
+    adjusted, matches = _adjust(measurements, first, prior, selection, config, masks, progress)
+    progress("checking", 0.8)
     reference = replace(
         reference_frame(recording, selection, first, config.reference), is_metric=first.scale_source != "none"
     )
-    calibration = _conclude(selection, first, adjusted, handed_over, reference, config)
-    return RigEstimate(calibration, adjusted, handed_over)
+    calibration = _conclude(selection, first, adjusted, matches, reference, config)
+    return RigEstimate(calibration, adjusted, matches)
 
 
 def _adjust(
     measurements: RigMeasurements,
-    first: FirstRig,
+    first: InitialRig,
     prior: RigPrior,
     selection: Selection,
     config: CalibrateConfig,
     masks: Path,
-    tell: Tell,
-) -> tuple[AdjustedRig, HandOver]:
-    """The rig adjustment: alone first, then with landmarks handed over between cameras and times."""
+    progress: StageProgress,
+) -> tuple[AdjustedRig, CrossCameraMatches]:
+    """The rig bundle adjustment: alone first, then with landmarks associated across cameras and times."""
     assembled = assemble_problem(measurements, first.start, config.adjustment)
     assembled = replace(assembled, problem=prior.constrained(assembled.problem))
-    tell(f"adjusting {len(assembled.problem.observations)} observations", 0.0)
+    progress(f"adjusting {len(assembled.problem.observations)} observations", 0.0)
     adjusted = adjust(assembled, config.adjustment, to_be_continued=config.adjustment.cross_camera)
     if not config.adjustment.cross_camera:
-        return adjusted, HandOver.nothing()
-    return adjust_with_hand_over(
+        return adjusted, CrossCameraMatches.nothing()
+    return adjust_with_association(
         adjusted,
         selection.cameras,
         masks,
         config.adjustment,
-        config.hand_over,
-        lambda words: tell(words, 0.5),
+        config.association,
+        lambda words: progress(words, 0.5),
     )
 
 
 def _conclude(
     selection: Selection,
-    first: FirstRig,
+    first: InitialRig,
     adjusted: AdjustedRig,
-    handed_over: HandOver,
+    matches: CrossCameraMatches,
     reference: ReferenceFrame,
     config: CalibrateConfig,
 ) -> Calibration:
@@ -134,14 +134,14 @@ def _conclude(
     topics = {name: stream.topic for name, stream in selection.cameras.items()}
     calibration = calibrated_cameras(solution, covariance, reference, statistics, topics)
     others = [camera for name, camera in calibration.cameras.items() if name != reference.name]
-    if not any(camera.determined_axes.any() for camera in others):
+    if not any(camera.observable_axes.any() for camera in others):
         raise UnobservableError(
-            "The motion determined nothing of any camera.", remedy=others[0].undetermined[0].remedy
+            "The motion determined nothing of any camera.", remedy=others[0].unobservable[0].remedy
         )
     return calibration.with_checks(
         residuals=statistics,
         split_half=split_half_summary(split_half(solution.problem, reference, config.adjustment)),
-        hand_over=hand_over_errors(solution, handed_over.unused),
+        association=association_errors(solution, matches.unused),
         scale_source=first.scale_source,
         converged=solution.report.converged,
         imu_noise_factors=imu_noise_factors(selection.imu, solution.problem.imu),
@@ -149,11 +149,11 @@ def _conclude(
 
 
 def reference_frame(
-    recording: Recording, selection: Selection, first: FirstRig, wanted: str
+    recording: Recording, selection: Selection, first: InitialRig, wanted: str
 ) -> ReferenceFrame:
     """The frame to report in; `base_link` needs the recording to say where the IMU sits on it."""
     if wanted == "auto":
-        wanted = "imu" if selection.imu is not None else first.leader
+        wanted = "imu" if selection.imu is not None else first.reference_camera
     if wanted == "imu" and selection.imu is not None:
         return ReferenceFrame("imu", SE3.identity())
     if wanted == "base_link" and selection.imu is not None:

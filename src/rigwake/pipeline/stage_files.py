@@ -1,4 +1,4 @@
-"""The files that stages leave, so that a run can be looked into, resumed, and fed with foreign results."""
+"""The files that stages leave, so that a run can be looked into, resumed, and fed with external results."""
 
 from __future__ import annotations
 

@@ -12,7 +12,8 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from rigwake.recording import Finding, Stamps
+from rigwake._types import Stamps
+from rigwake.recording import Finding
 
 Encoding = Literal["ros1", "cdr"]
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._types import Array, Stamps
 from rigwake.errors import InputError
 from rigwake.geometry import so3
 from rigwake.geometry.geodesy import enu_from_lla
-from rigwake.geometry.so3 import Array
+from rigwake.readers.csv_tables import Table, read_table
 from rigwake.readers.streams import symmetric_psd, unit_quaternions, usable_rows
-from rigwake.readers.tables import Table, read_table
-from rigwake.recording import AttitudeStream, Finding, GnssStream, ImuStream, Stamps
+from rigwake.recording import AttitudeStream, Finding, GnssStream, ImuStream
 
 Findings = tuple[Finding, ...]
 _GYRO = (

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rigwake.cameras.base import CameraModel
+from rigwake._types import Stamps
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import InputError
 from rigwake.readers.csv_sensors import read_attitude_csv, read_gnss_csv, read_imu_csv
+from rigwake.readers.csv_tables import read_table, stamps_from_text
 from rigwake.readers.image_files import (
     IMAGE_SUFFIXES,
     VIDEO_SUFFIXES,
@@ -23,7 +25,6 @@ from rigwake.readers.image_files import (
 from rigwake.readers.nmea import read_nmea
 from rigwake.readers.rig_file import read_rig_file
 from rigwake.readers.streams import time_order
-from rigwake.readers.tables import read_table, stamps_from_text
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.recording import (
     AttitudeStream,
@@ -33,7 +34,6 @@ from rigwake.recording import (
     GnssStream,
     ImuStream,
     Recording,
-    Stamps,
 )
 from rigwake.rig import Rig
 from rigwake.trajectory import Trajectory
@@ -44,7 +44,7 @@ _TABLES = ("imu", "gnss", "attitude")
 
 
 @dataclass
-class _Found:
+class _FolderStreams:
     root: Path
     models: Mapping[str, CameraModel] = field(default_factory=dict)
     rig: Rig | None = None
@@ -68,7 +68,7 @@ def _table_of(path: Path) -> str | None:
 
 def read_folder(path: Path) -> Recording:
     """Read a plain folder. Raises InputError if no sensor of it can be read."""
-    found = _Found(path)
+    found = _FolderStreams(path)
     if (path / "rig.yaml").is_file():
         found.models, found.rig = read_rig_file(path / "rig.yaml")
     flat = [path] if image_files(path) else []
@@ -97,7 +97,7 @@ def read_folder(path: Path) -> Recording:
     )
 
 
-def _adder(entry: Path) -> Callable[[Path, _Found], None] | None:
+def _adder(entry: Path) -> Callable[[Path, _FolderStreams], None] | None:
     suffix = entry.suffix.lower()
     if entry.is_dir():
         return _add_images if image_files(entry) else None
@@ -106,7 +106,7 @@ def _adder(entry: Path) -> Callable[[Path, _Found], None] | None:
     return _add_nmea if suffix == ".nmea" else _ADD_TABLE.get(_table_of(entry) or "")
 
 
-def _add_images(folder: Path, found: _Found) -> None:
+def _add_images(folder: Path, found: _FolderStreams) -> None:
     name = "camera" if folder == found.root else folder.name
     listed = folder / "timestamps.csv"
     shared = found.root / "timestamps.csv"
@@ -147,7 +147,9 @@ def _unlisted(name: str, folder: Path, findings: list[Finding]) -> tuple[list[st
     return [file.name for file in files], np.arange(len(files), dtype=np.int64) * _NOMINAL_PERIOD_NS
 
 
-def _add_camera(name: str, source: FrameSource, size: tuple[int, int], stamps: Stamps, found: _Found) -> None:
+def _add_camera(
+    name: str, source: FrameSource, size: tuple[int, int], stamps: Stamps, found: _FolderStreams
+) -> None:
     model = found.models.get(name)
     if model is not None and (model.width_px, model.height_px) != tuple(size):
         message = (
@@ -161,7 +163,7 @@ def _add_camera(name: str, source: FrameSource, size: tuple[int, int], stamps: S
     found.cameras[name] = CameraStream(name, stamps, source, *size, model, name)
 
 
-def _add_video(path: Path, found: _Found) -> None:
+def _add_video(path: Path, found: _FolderStreams) -> None:
     index = index_video(path)
     stamps = index.stamps_ns()
     listed = path.with_name(f"{path.stem}_timestamps.csv")
@@ -179,29 +181,29 @@ def _add_video(path: Path, found: _Found) -> None:
     _add_camera(path.stem, VideoFrames(path, index, stamps[order]), index.size, stamps[order], found)
 
 
-def _add_imu(path: Path, found: _Found) -> None:
+def _add_imu(path: Path, found: _FolderStreams) -> None:
     found.imus[path.stem], findings = read_imu_csv(path, path.stem)
     found.findings += findings
 
 
-def _add_gnss(path: Path, found: _Found) -> None:
+def _add_gnss(path: Path, found: _FolderStreams) -> None:
     found.gnss[path.stem], findings = read_gnss_csv(path, path.stem)
     found.findings += findings
 
 
-def _add_attitude(path: Path, found: _Found) -> None:
+def _add_attitude(path: Path, found: _FolderStreams) -> None:
     found.attitudes[path.stem], findings = read_attitude_csv(path, path.stem)
     found.findings += findings
 
 
-_ADD_TABLE: dict[str, Callable[[Path, _Found], None]] = {
+_ADD_TABLE: dict[str, Callable[[Path, _FolderStreams], None]] = {
     "imu": _add_imu,
     "gnss": _add_gnss,
     "attitude": _add_attitude,
 }
 
 
-def _add_nmea(path: Path, found: _Found) -> None:
+def _add_nmea(path: Path, found: _FolderStreams) -> None:
     found.gnss[path.stem], attitude, findings = read_nmea(path, path.stem)
     if attitude is not None:
         found.attitudes[attitude.name] = attitude

@@ -12,9 +12,10 @@ import av.error
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._types import Stamps
 from rigwake.errors import InputError
 from rigwake.readers.images import ImageSize, checked_size, compressed_size, decode_compressed
-from rigwake.recording import Frame, Stamps
+from rigwake.recording import Frame
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v"})

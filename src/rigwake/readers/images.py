@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._types import Image
 from rigwake.errors import InputError
-from rigwake.recording import Image
 
 MAX_PIXELS = 2**27
 """134 megapixels: above any machine-vision sensor, below what endangers memory."""

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from rigwake.cameras.ros import camera_from_info
+from rigwake._types import Array, Stamps
+from rigwake.cameras.formats.camera_info import camera_from_info
 from rigwake.errors import CameraError, InputError
 from rigwake.geometry import so3
 from rigwake.geometry.geodesy import enu_from_lla
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
+from rigwake.readers.csv_tables import stamps_from_text
 from rigwake.readers.image_files import FileFrames, first_file_size, image_files
 from rigwake.readers.rig_file import rigid_transform
 from rigwake.readers.streams import time_order, usable_rows
-from rigwake.readers.tables import stamps_from_text
 from rigwake.readers.trajectories import read_trajectory
-from rigwake.recording import AttitudeStream, CameraStream, Finding, GnssStream, ImuStream, Recording, Stamps
+from rigwake.recording import AttitudeStream, CameraStream, Finding, GnssStream, ImuStream, Recording
 from rigwake.rig import Rig, RigCamera
 from rigwake.trajectory import Trajectory
 

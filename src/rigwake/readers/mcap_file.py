@@ -42,7 +42,7 @@ class _ChannelRecord(NamedTuple):
 
 
 @dataclass
-class _Scan:
+class _McapScan:
     """What the pass has gathered so far; messages outside chunks belong to one chunk that is the file."""
 
     chunks: list[Chunk] = field(default_factory=list)
@@ -61,7 +61,7 @@ def index_mcap(path: Path) -> BagIndex:
         if os.pread(file, len(MAGIC), 0) != MAGIC:
             raise InputError(f"{path.name} is not an MCAP file.")
         file_bytes = os.fstat(file).st_size
-        scan = _Scan()
+        scan = _McapScan()
         _scan_records(file, file_bytes, scan)
         _complete_from_chunks(file, scan)
     finally:
@@ -70,12 +70,12 @@ def index_mcap(path: Path) -> BagIndex:
     for channel, loose in scan.loose.items():
         entry = (len(scan.chunks) - 1, np.array(loose, _ENTRY))
         scan.entries.setdefault(channel, []).append(entry)
-    channels, foreign = _channels(path, scan)
+    channels, other = _channels(path, scan)
     findings = [Finding("error", "", f"{problem}; what could be read is kept.") for problem in scan.problems]
-    return BagIndex("mcap", joined(channels), (*findings, *foreign))
+    return BagIndex("mcap", joined(channels), (*findings, *other))
 
 
-def _scan_records(file: int, file_bytes: int, scan: _Scan) -> None:
+def _scan_records(file: int, file_bytes: int, scan: _McapScan) -> None:
     position, operation = len(MAGIC), 0
     while position < file_bytes and operation != _FOOTER:
         try:
@@ -111,7 +111,7 @@ def _record_head(start: bytes) -> tuple[int, int]:
     return operation, content_bytes
 
 
-def _add_chunk(start: bytes, content: int, stored_bytes: int, scan: _Scan) -> None:
+def _add_chunk(start: bytes, content: int, stored_bytes: int, scan: _McapScan) -> None:
     # start time, end time, unpacked size, crc, compression (string), packed size, records
     if len(start) < 32:
         raise InputError("a chunk is cut off")
@@ -133,7 +133,7 @@ def _add_loose(start: bytes, position: int, loose: dict[int, list[tuple[int, int
     loose.setdefault(channel, []).append((log_time, position))
 
 
-def _add_small(operation: int, content: bytes, scan: _Scan) -> None:
+def _add_small(operation: int, content: bytes, scan: _McapScan) -> None:
     try:
         (number,) = struct.unpack_from("<H", content)
         if operation == _SCHEMA:
@@ -160,7 +160,7 @@ def _string(content: bytes, at: int) -> tuple[str, int]:
     return content[at + 4 : at + 4 + size].decode("utf-8", "replace"), at + 4 + size
 
 
-def _complete_from_chunks(file: int, scan: _Scan) -> None:
+def _complete_from_chunks(file: int, scan: _McapScan) -> None:
     """Walk through chunks that have no index, and those that hold channels not yet known."""
     unknown = {rows[0][0] for channel, rows in scan.entries.items() if channel not in scan.channels}
     for chunk_row in sorted((set(range(len(scan.chunks))) - scan.indexed_chunks) | unknown):
@@ -170,7 +170,7 @@ def _complete_from_chunks(file: int, scan: _Scan) -> None:
             scan.problems.append(f"Chunk {chunk_row} is lost ({error.cause})")
 
 
-def _walk_chunk(content: bytes, chunk_row: int, scan: _Scan) -> None:
+def _walk_chunk(content: bytes, chunk_row: int, scan: _McapScan) -> None:
     found: dict[int, list[tuple[int, int]]] = {}
     at = 0
     while at < len(content):
@@ -191,13 +191,13 @@ def _walk_chunk(content: bytes, chunk_row: int, scan: _Scan) -> None:
             scan.entries.setdefault(channel, []).append((chunk_row, np.array(entries, _ENTRY)))
 
 
-def _channels(path: Path, scan: _Scan) -> tuple[list[Channel], list[Finding]]:
-    channels, foreign = [], []
+def _channels(path: Path, scan: _McapScan) -> tuple[list[Channel], list[Finding]]:
+    channels, other = [], []
     for number, (schema_id, topic, encoding_name) in scan.channels.items():
         encoding = _ENCODINGS.get(encoding_name)
         if encoding is None:
             message = f"{topic}: messages are encoded as {encoding_name!r}, not as ROS messages; left out."
-            foreign.append(Finding("note", topic, message))
+            other.append(Finding("note", topic, message))
             continue
         parts = sorted(scan.entries.get(number, []), key=lambda part: part[0])
         entries = np.concatenate([np.empty(0, _ENTRY), *(part for _, part in parts)])
@@ -207,4 +207,4 @@ def _channels(path: Path, scan: _Scan) -> tuple[list[Channel], list[Finding]]:
         stamps = np.minimum(entries["time"], 2**62).astype(np.int64)
         message_type = standard_type_name(scan.schemas.get(schema_id, ""))
         channels.append(Channel(topic, message_type, encoding, stamps, payloads))
-    return channels, foreign
+    return channels, other

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from rigwake.errors import InputError
 from rigwake.readers.channels import BagIndex
-from rigwake.readers.euroc import euroc_root, read_euroc
+from rigwake.readers.euroc_folder import euroc_root, read_euroc
 from rigwake.readers.folder import is_plain_folder, read_folder
 from rigwake.readers.kitti import is_kitti_odometry, is_kitti_raw, read_kitti_odometry, read_kitti_raw
 from rigwake.readers.mcap_file import MAGIC as MCAP_MAGIC
 from rigwake.readers.mcap_file import index_mcap
 from rigwake.readers.nmea import looks_like_nmea, nmea_recording
-from rigwake.readers.ros import recording_from_bag
+from rigwake.readers.ros_recording import recording_from_bag
 from rigwake.readers.rosbag1 import MAGIC as ROSBAG1_MAGIC
 from rigwake.readers.rosbag1 import index_rosbag1
 from rigwake.readers.rosbag2 import METADATA, SQLITE_MAGIC, index_rosbag2_folder, index_sqlite

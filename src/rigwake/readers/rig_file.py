@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.catalogue import camera_from_dict
+from rigwake.cameras.protocol import CameraModel
+from rigwake.cameras.registry import camera_from_dict
 from rigwake.errors import CameraError, InputError
 from rigwake.geometry.se3 import SE3
 from rigwake.rig import Rig, RigCamera

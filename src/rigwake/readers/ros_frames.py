@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._types import Image, Stamps
 from rigwake.errors import InputError
 from rigwake.readers.channels import Channel
 from rigwake.readers.images import ImageSize, checked_size, compressed_size, decode_compressed, decode_raw
-from rigwake.readers.ros_messages import decode
-from rigwake.recording import Frame, Image, Stamps
+from rigwake.readers.ros_decoding import decode
+from rigwake.recording import Frame
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 IMAGE_TYPES = frozenset({RAW, COMPRESSED})

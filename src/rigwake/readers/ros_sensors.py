@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from rigwake._types import Array, Stamps
 from rigwake.errors import InputError
 from rigwake.geometry import so3
 from rigwake.geometry.geodesy import enu_from_lla
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array
 from rigwake.readers.channels import Channel
-from rigwake.readers.ros_messages import decode_all, stamped_rows, trailing_doubles
+from rigwake.readers.ros_decoding import decode_all, stamped_rows, trailing_doubles
 from rigwake.readers.streams import LARGEST_VALUE, symmetric_psd, unit_quaternions, usable_rows
-from rigwake.recording import AttitudeStream, Finding, GnssStream, ImuStream, Stamps
+from rigwake.recording import AttitudeStream, Finding, GnssStream, ImuStream
 from rigwake.trajectory import Trajectory
 
 IMU, FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"

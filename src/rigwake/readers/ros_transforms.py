@@ -10,7 +10,7 @@ import numpy as np
 from rigwake.errors import InputError
 from rigwake.geometry.se3 import SE3
 from rigwake.readers.channels import Channel
-from rigwake.readers.ros_messages import decode_all
+from rigwake.readers.ros_decoding import decode_all
 from rigwake.readers.ros_sensors import pose_trajectory
 from rigwake.readers.streams import LARGEST_VALUE, unit_quaternions
 from rigwake.recording import Finding

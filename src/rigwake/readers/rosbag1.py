@@ -47,7 +47,7 @@ class Record(NamedTuple):
 
 
 @dataclass
-class _Scan:
+class _BagScan:
     """What the pass has gathered so far."""
 
     chunks: list[Chunk] = field(default_factory=list)
@@ -63,7 +63,7 @@ def index_rosbag1(path: Path) -> BagIndex:
     try:
         if os.pread(file, len(MAGIC), 0) != MAGIC:
             raise InputError(f"{path.name} is not a ROS 1 bag of format 2.0.")
-        scan = _Scan()
+        scan = _BagScan()
         _scan_records(file, os.fstat(file).st_size, scan)
         _complete_from_chunks(file, scan)
     finally:
@@ -74,7 +74,7 @@ def index_rosbag1(path: Path) -> BagIndex:
     return BagIndex("ros1 bag", joined(_channels(path, scan)), findings)
 
 
-def _scan_records(file: int, file_bytes: int, scan: _Scan) -> None:
+def _scan_records(file: int, file_bytes: int, scan: _BagScan) -> None:
     position = len(MAGIC)
     while position < file_bytes:
         try:
@@ -128,7 +128,7 @@ def parse_fields(header: bytes) -> dict[str, bytes]:
     return fields
 
 
-def _add_chunk(record: Record, stored_bytes: int, scan: _Scan) -> None:
+def _add_chunk(record: Record, stored_bytes: int, scan: _BagScan) -> None:
     compression = record.fields.get("compression", b"").decode("ascii", "replace")
     content_bytes = record.number("size", "<I")
     if compression == "none":
@@ -136,7 +136,7 @@ def _add_chunk(record: Record, stored_bytes: int, scan: _Scan) -> None:
     scan.chunks.append(Chunk(record.data_position, stored_bytes, content_bytes, compression))
 
 
-def _add_index(file: int, record: Record, scan: _Scan) -> None:
+def _add_index(file: int, record: Record, scan: _BagScan) -> None:
     if not scan.chunks:
         raise InputError("an index stands before any chunk")
     count = record.number("count", "<I")
@@ -148,7 +148,7 @@ def _add_index(file: int, record: Record, scan: _Scan) -> None:
     scan.indexed_chunks.add(chunk_row)
 
 
-def _add_connection(details: bytes, record: Record, scan: _Scan) -> None:
+def _add_connection(details: bytes, record: Record, scan: _BagScan) -> None:
     fields = parse_fields(details)
     texts = [
         raw.decode("utf-8", "replace")
@@ -157,7 +157,7 @@ def _add_connection(details: bytes, record: Record, scan: _Scan) -> None:
     scan.connections[record.number("conn", "<I")] = (texts[0], texts[1], texts[2])
 
 
-def _complete_from_chunks(file: int, scan: _Scan) -> None:
+def _complete_from_chunks(file: int, scan: _BagScan) -> None:
     """Walk through chunks that have no index, and those that hold connections not yet known."""
     unknown = {rows[0][0] for conn, rows in scan.entries.items() if conn not in scan.connections}
     for chunk_row in sorted((set(range(len(scan.chunks))) - scan.indexed_chunks) | unknown):
@@ -167,7 +167,7 @@ def _complete_from_chunks(file: int, scan: _Scan) -> None:
             scan.problems.append(f"Chunk {chunk_row} is lost ({error.cause})")
 
 
-def _walk_chunk(content: bytes, chunk_row: int, scan: _Scan) -> None:
+def _walk_chunk(content: bytes, chunk_row: int, scan: _BagScan) -> None:
     found: dict[int, list[tuple[int, int, int]]] = {}
     at = 0
     while at < len(content):
@@ -190,7 +190,7 @@ def _walk_chunk(content: bytes, chunk_row: int, scan: _Scan) -> None:
             scan.entries.setdefault(connection, []).append((chunk_row, np.array(entries, _ENTRY)))
 
 
-def _channels(path: Path, scan: _Scan) -> list[Channel]:
+def _channels(path: Path, scan: _BagScan) -> list[Channel]:
     channels = []
     for connection, (topic, message_type, digest) in scan.connections.items():
         parts = sorted(scan.entries.get(connection, []), key=lambda part: part[0])

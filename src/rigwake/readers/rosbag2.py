@@ -13,10 +13,11 @@ import numpy as np
 import yaml
 import zstandard
 
+from rigwake._types import Stamps
 from rigwake.errors import InputError
 from rigwake.readers.channels import MAX_MESSAGE_BYTES, BagIndex, Channel, joined, standard_type_name
 from rigwake.readers.mcap_file import index_mcap
-from rigwake.recording import Finding, Stamps
+from rigwake.recording import Finding
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 METADATA = "metadata.yaml"

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from rigwake.geometry.so3 import Array
-from rigwake.recording import Finding, Stamps
-
-Rows = NDArray[np.int64]
+from rigwake._types import Array, Indices, Stamps
+from rigwake.recording import Finding
 
 LARGEST_VALUE = 1e9
 """No position (m), rate, force or variance of a vessel is larger: such a value is damage."""
 
 
-def time_order(sensor: str, timestamps_ns: Stamps) -> tuple[Rows, list[Finding]]:
-    """Rows that put the stamps in strictly increasing order (of equal stamps the first stays), and what
+def time_order(sensor: str, timestamps_ns: Stamps) -> tuple[Indices, list[Finding]]:
+    """Indices that put the stamps in strictly increasing order (of equal stamps the first stays), and what
     that repaired."""
     stamps = np.asarray(timestamps_ns, dtype=np.int64)
     steps = np.diff(stamps)
@@ -33,8 +31,8 @@ def time_order(sensor: str, timestamps_ns: Stamps) -> tuple[Rows, list[Finding]]
     return order[fresh], findings
 
 
-def sane_rows(sensor: str, *columns: ArrayLike) -> tuple[Rows, list[Finding]]:
-    """Rows in which every column is finite and of possible size, and how many were dropped."""
+def sane_rows(sensor: str, *columns: ArrayLike) -> tuple[Indices, list[Finding]]:
+    """Indices in which every column is finite and of possible size, and how many were dropped."""
     good = np.ones(len(np.asarray(columns[0])), dtype=bool)
     for column in columns:
         values = np.asarray(column, dtype=np.float64)
@@ -46,8 +44,10 @@ def sane_rows(sensor: str, *columns: ArrayLike) -> tuple[Rows, list[Finding]]:
     return np.flatnonzero(good), [Finding("warning", sensor, message)]
 
 
-def usable_rows(sensor: str, timestamps_ns: Stamps, *columns: ArrayLike) -> tuple[Rows, tuple[Finding, ...]]:
-    """Rows that are finite, in strictly increasing time order."""
+def usable_rows(
+    sensor: str, timestamps_ns: Stamps, *columns: ArrayLike
+) -> tuple[Indices, tuple[Finding, ...]]:
+    """Indices that are finite, in strictly increasing time order."""
     sane, dropped = sane_rows(sensor, *columns)
     order, sorted_findings = time_order(sensor, np.asarray(timestamps_ns)[sane])
     return sane[order], (*dropped, *sorted_findings)

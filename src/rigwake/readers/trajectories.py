@@ -22,15 +22,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rigwake._types import Array, Stamps
 from rigwake.errors import InputError, TrajectoryError
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.so3 import Array, nearest_rotation
+from rigwake.geometry.so3 import nearest_rotation
 from rigwake.recording import Finding
 from rigwake.trajectory import CovarianceKind, Trajectory
-
-Stamps = NDArray[np.int64]
 
 TrajectoryFormat = Literal["tum", "kitti", "euroc", "csv"]
 _NOMINAL_RATE_HZ = 10  # of KITTI files without times

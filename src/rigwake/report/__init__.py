@@ -1,7 +1,7 @@
-"""A report people can check: verdict, rig, doubt, residuals, pictures, in one HTML file."""
+"""A report people can check: verdict, rig, uncertainty, residuals, pictures, in one HTML file."""
 
 from rigwake.report.content import ReportContent, load_report_content
-from rigwake.report.page import build_report
-from rigwake.report.summary import summary_lines
+from rigwake.report.report_page import build_report
+from rigwake.report.report_summary import summary_lines
 
 __all__ = ["ReportContent", "build_report", "load_report_content", "summary_lines"]

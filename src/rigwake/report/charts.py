@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup, escape
 
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array
 from rigwake.report.reduce import ImageMap
 
 WIDTH, HEIGHT = 480.0, 220.0
@@ -118,10 +118,10 @@ def image_map(title: str, data: ImageMap, colour: int) -> Markup:
     most = max(float(data.counts.max()), 1.0)
     parts = [f'<rect class="frame" width="{width:.1f}" height="{height:.1f}"/>']
     for r, c in zip(*np.nonzero(data.counts), strict=True):
-        share = np.sqrt(data.counts[r, c] / most)
+        fraction = np.sqrt(data.counts[r, c] / most)
         parts.append(
             f'<rect class="cell c{colour % COLOURS}" x="{c * du:.1f}" y="{r * dv:.1f}" width="{du:.2f}" '
-            f'height="{dv:.2f}" fill-opacity="{0.12 + 0.6 * share:.2f}"/>'
+            f'height="{dv:.2f}" fill-opacity="{0.12 + 0.6 * fraction:.2f}"/>'
         )
     if data.mean_px is not None:
         parts += _arrows(data.mean_px, du, dv)

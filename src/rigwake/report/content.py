@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from rigwake.calibration import Calibration, load_calibration
-from rigwake.cameras.base import CameraModel
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import InputError, RigwakeError
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.report.reduce import ResidualSummary, TrackSummary, summarise_residuals, summarise_tracks
@@ -43,7 +43,7 @@ class OverlayPoint:
 class Picture:
     """One image of the recording with what the calibration says about it.
 
-    kind: `horizon` (horizon_px: the predicted horizon as a polyline, NaN between pieces) or `hand_over` (points).
+    kind: `horizon` (horizon_px: the predicted horizon as a polyline, NaN between pieces) or `association` (points).
     """
 
     camera: str

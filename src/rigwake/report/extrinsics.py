@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigwake._types import Array
 from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.geometry.euler import yaw_pitch_roll
 from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
-from rigwake.geometry.so3 import Array
 
-NOT_DETERMINED = "not determined"
+UNOBSERVABLE = "unobservable"
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class Value:
     std: str = ""
 
     @property
-    def is_determined(self) -> bool:
+    def is_observable(self) -> bool:
         """Whether there is a number."""
-        return self.text != NOT_DETERMINED
+        return self.text != UNOBSERVABLE
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def _direction(key: str, a_from_b: SE3, std: Array) -> Direction:
 
 
 def _copies(key: str, a_from_b: SE3, quat_wxyz: Array) -> tuple[tuple[str, str], ...]:
-    """What the copy buttons hold: full precision; nothing at all if a part is not determined."""
+    """What the copy buttons hold: full precision; nothing at all if a part is unobservable."""
     matrix = a_from_b.matrix
     if not np.isfinite(matrix).all():
         return ()
@@ -91,7 +91,7 @@ def _copies(key: str, a_from_b: SE3, quat_wxyz: Array) -> tuple[tuple[str, str],
 def number(value: float, digits: int) -> str:
     """Fixed decimals with a true minus sign, or the words for what there is no number for."""
     if not np.isfinite(value):
-        return NOT_DETERMINED
+        return UNOBSERVABLE
     return f"{value + 0.0:.{digits}f}".replace("-", "−")
 
 
@@ -114,7 +114,7 @@ def looks(camera: CalibratedCamera, reference: str) -> str:
     """In words, where the camera looks in a rig whose x points ahead and z up."""
     rotation = camera.rig_from_cam.rotation
     if not np.isfinite(rotation).all():
-        return "looking direction not determined"
+        return "looking direction unobservable"
     if reference not in ("imu", "base_link"):
         return ""
     ahead, right = rotation[:, 2], rotation[:, 0]

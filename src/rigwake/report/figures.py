@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from rigwake.atomic import atomic_path
 from rigwake.report.content import RIG_TRAJECTORY, ReportContent
-from rigwake.report.motion import paths_in_one_world
-from rigwake.report.reduce import Curve, ResidualSummary
+from rigwake.report.motion_figures import paths_in_one_world
+from rigwake.report.reduce import BinnedCurve, ResidualSummary
 
 # Okabe and Ito: told apart also by the colour-blind
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8F8400", "#4D4D4D")
@@ -108,7 +108,9 @@ def _paths(content: ReportContent) -> Figure | None:
     return figure
 
 
-def _curves(content: ReportContent, pick: Callable[[ResidualSummary], Curve], x_label: str) -> Figure | None:
+def _curves(
+    content: ReportContent, pick: Callable[[ResidualSummary], BinnedCurve], x_label: str
+) -> Figure | None:
     if not content.residuals:
         return None
     figure, axes = _axes(content, x_label, "median residual (px)")
@@ -121,7 +123,7 @@ def _curves(content: ReportContent, pick: Callable[[ResidualSummary], Curve], x_
 
 
 def _sigmas(content: ReportContent) -> Figure | None:
-    """Per camera the six standard deviations; what is not determined has no point."""
+    """Per camera the six standard deviations; what is unobservable has no point."""
     cameras = content.calibration.cameras
     if not any(np.isfinite(c.std_rotation_deg).any() for c in cameras.values()):
         return None

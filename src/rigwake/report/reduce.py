@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from rigwake.cameras.base import CameraModel
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array
+from rigwake.cameras.protocol import CameraModel
 
 MAP_COLUMNS, MAP_ROWS = 24, 18
 ANGLE_STEP_DEG = 5.0
@@ -30,7 +30,7 @@ class ImageMap:
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class BinnedCurve:
     """Quantiles of the size of residuals in bins: at (B,), median and 90 % (B,), counts (B,)."""
 
     at: Array
@@ -47,8 +47,8 @@ class ResidualSummary:
     rms_px: float
     median_px: float
     image: ImageMap
-    over_angle: Curve
-    over_time: Curve
+    over_angle: BinnedCurve
+    over_time: BinnedCurve
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ def _image_map(pixels: np.ndarray, lens: CameraModel | None, residuals: Array | 
     return ImageMap(width_px, height_px, counts.reshape(shape), mean.reshape(*shape, 2))
 
 
-def _curve(at: np.ndarray, size: Array, edges: Array) -> Curve:
+def _curve(at: np.ndarray, size: Array, edges: Array) -> BinnedCurve:
     """Median and 90 % of `size` between the edges: one sort, then slices."""
     known = np.isfinite(at)
     at, size = at[known], size[known]
@@ -142,4 +142,6 @@ def _curve(at: np.ndarray, size: Array, edges: Array) -> Curve:
     counts = np.diff(starts)
     for k in np.flatnonzero(counts >= FEWEST):
         quantiles[k] = np.quantile(size[starts[k] : starts[k + 1]], (0.5, 0.9))
-    return Curve((edges[:-1] + edges[1:]) / 2, quantiles[:, 0], quantiles[:, 1], counts.astype(np.float64))
+    return BinnedCurve(
+        (edges[:-1] + edges[1:]) / 2, quantiles[:, 0], quantiles[:, 1], counts.astype(np.float64)
+    )

@@ -12,7 +12,7 @@ import numpy as np
 from rigwake.errors import UsageError
 from rigwake.geometry.se3 import SE3
 from rigwake.report.content import RIG_TRAJECTORY, ReportContent
-from rigwake.report.motion import thin
+from rigwake.report.motion_figures import thin
 
 
 def log_to_rerun(content: ReportContent, rrd: Path | None, view: bool) -> None:
@@ -68,9 +68,9 @@ def _transform(rerun: Any, parent_from_child: SE3) -> Any:
 def _log_cameras(rerun: Any, stream: Any, content: ReportContent) -> None:
     """Cameras that are fully determined; a partly known transform has no place in a tree of transforms."""
     for name, camera in content.calibration.cameras.items():
-        if not camera.is_determined:
-            words = ", ".join(d.words for d in camera.undetermined)
-            stream.log(f"world/rig/{name}", rerun.TextLog(f"not determined: {words}"), static=True)
+        if not camera.is_observable:
+            words = ", ".join(d.words for d in camera.unobservable)
+            stream.log(f"world/rig/{name}", rerun.TextLog(f"unobservable: {words}"), static=True)
             continue
         stream.log(f"world/rig/{name}", _transform(rerun, camera.rig_from_cam), static=True)
         if camera.model is not None:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from rigwake._types import Array
 from rigwake.calibration import CalibratedCamera, Calibration
-from rigwake.geometry.so3 import Array
 
 # the outline of a hull seen from above, bow at x = 0.5, one long
 _HALF_HULL = [(0.36, 0.1), (0.15, 0.17), (-0.2, 0.18), (-0.5, 0.15)]
@@ -19,7 +19,7 @@ _PATH_DIGITS = 3
 
 
 def rig_scene(calibration: Calibration) -> dict[str, Any]:
-    """Cameras in the frame of the rig; what is not determined is null, and `open` gives its directions."""
+    """Cameras in the frame of the rig; what is unobservable is null, and `open` gives its directions."""
     positions = np.array([c.rig_from_cam.translation for c in calibration.cameras.values()])
     known = np.nan_to_num(positions)
     extent = float(max(np.ptp(known, axis=0).max(), 0.5))
@@ -68,7 +68,7 @@ def _camera(camera: CalibratedCamera, extent: float) -> dict[str, Any]:
         "frustum": frustum,
         "sigma_axes": axes,
         "open": [  # only translations can be drawn as lines
-            _rounded(d.direction[3:]) for d in camera.undetermined if np.linalg.norm(d.direction[3:]) > 0.1
+            _rounded(d.direction[3:]) for d in camera.unobservable if np.linalg.norm(d.direction[3:]) > 0.1
         ],
     }
 

@@ -6,12 +6,10 @@ from typing import Final
 
 import numpy as np
 
-from rigwake.cameras.base import Mask
-from rigwake.recording import Image
+from rigwake._types import Image, Indices, Mask
 from rigwake.tracking.klt_front_end import Observed
 from rigwake.tracking.matching import Keypoints, keypoint_detector, match_descriptors
-from rigwake.tracking.options import FrontEndName, TrackingOptions
-from rigwake.tracks import Indices
+from rigwake.tracking.tracking_options import FrontEndName, TrackingOptions
 
 _STD_PX: Final[dict[FrontEndName, float]] = {"sift": 0.15, "orb": 0.45, "fast-brief": 0.5}
 """Standard deviation of a keypoint of the finest scale; measured in `benchmarks/tracking.py`."""

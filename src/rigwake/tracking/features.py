@@ -7,9 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rigwake.cameras.base import Mask
-from rigwake.geometry.so3 import Array
-from rigwake.recording import Image
+from rigwake._types import Array, Image, Mask
 
 _BLOCK_PX = 7  # window of the structure tensor
 

@@ -11,14 +11,14 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.cameras.base import CameraModel, Mask
+from rigwake._types import Array, Image, Mask
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import UsageError
-from rigwake.geometry.so3 import Array
-from rigwake.recording import CameraStream, Frame, Image
+from rigwake.recording import CameraStream, Frame
 from rigwake.tracking.descriptor_front_end import DescriptorFrontEnd
 from rigwake.tracking.klt_front_end import KltFrontEnd, Observed
 from rigwake.tracking.masks import CameraMask, lens_mask, shrunk
-from rigwake.tracking.options import TrackingOptions
+from rigwake.tracking.tracking_options import TrackingOptions
 from rigwake.tracking.water import HorizonMask
 from rigwake.tracks import TrackingReport, Tracks
 
@@ -37,7 +37,7 @@ def track_camera(
     """Follow points through the images of one camera.
 
     stream: must have a model, which turns pixels into bearings and predicts how patches deform.
-    mask: regions without static scene points (`lens_mask`, `find_hull`, `mask_from_file`); what the lens does not
+    mask: regions without static scene points (`lens_mask`, `find_self_mask`, `mask_from_file`); what the lens does not
         show is left out in any case.
     indices: which frames of the stream to use (all by default). progress: told the number of frames done.
     The same input gives the same tracks. Raises UsageError if the camera has no model.
@@ -54,7 +54,7 @@ def track_camera(
     front_end = _front_end(stream.model, options)
     last_ns: int | None = None
     horizon = None if up_cam is None else HorizonMask(stream.model)
-    run = _Run()
+    run = _TrackingRun()
     row_of_index = {int(index): row for row, index in enumerate(chosen)}
     started = time.perf_counter()
     for done, (frame, prepared) in enumerate(_ahead(stream.frames(chosen), front_end.prepare)):
@@ -124,7 +124,7 @@ def _static_region(stream: CameraStream, options: TrackingOptions, mask: CameraM
 
 
 @dataclass
-class _Run:
+class _TrackingRun:
     """What has been observed so far, and what happened to the frames."""
 
     rows: list[NDArray[np.int64]] = field(default_factory=list)

@@ -16,7 +16,7 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from rigwake.recording import Image
+from rigwake._types import Image
 
 Coefficients = NDArray[np.float32]
 

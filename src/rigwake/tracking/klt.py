@@ -15,10 +15,8 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from rigwake.cameras.base import Mask
-from rigwake.geometry.so3 import Array
-from rigwake.recording import Image
-from rigwake.threads import over_ranges, ranges
+from rigwake._types import Array, Image, Mask
+from rigwake.parallel import over_ranges, ranges
 
 Pyramid = tuple[NDArray[np.float32], ...]
 """An image and its halves, quarters, ..., each with a margin around it, mirrored."""
@@ -75,7 +73,7 @@ def follow(
 def _lucas_kanade(
     before: Pyramid, after: Pyramid, start: Array, landed: Array, found: Mask, window_px: int
 ) -> None:
-    """Moves `landed` (N, 2) from a first guess to where the windows about `start` are; clears `found` (N,) of those
+    """Moves `landed` (N, 2) from an initial guess to where the windows about `start` are; clears `found` (N,) of those
     that are not there."""
     padded = _padded(window_px)
     for level in reversed(range(len(before))):

@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.cameras.base import CameraModel, Mask
-from rigwake.geometry.so3 import Array
-from rigwake.recording import Image
+from rigwake._types import Array, Image, Mask
+from rigwake.cameras.protocol import CameraModel
 from rigwake.tracking.features import detect_corners
 from rigwake.tracking.interpolation import Coefficients, spline_coefficients
 from rigwake.tracking.klt import Pyramid, follow, pyramid
 from rigwake.tracking.masks import inside
-from rigwake.tracking.options import TrackingOptions
-from rigwake.tracking.references import PatchShape, References, drawn_by_bend, make_references
+from rigwake.tracking.references import PatchShape, References, make_references, registration_bias
 from rigwake.tracking.registration import register
+from rigwake.tracking.tracking_options import TrackingOptions
 from rigwake.tracking.warps import dominant_rotation, rotation_warps, stencil_bearings
 
 Observed = tuple[NDArray[np.int64], Array, Array]
@@ -37,7 +36,7 @@ class PreparedImage:
 class _Live:
     """The N points that are being followed.
 
-    warps: affine, image from reference patch; of these `turns` is the part that the camera's rotation explains.
+    warps: affine, image from reference patch; of these `rotation_parts` is the part that the camera's rotation explains.
     stencils, image_from_reference: bearings about the reference pixel, and the camera's rotation since.
     """
 
@@ -46,7 +45,7 @@ class _Live:
     bearings: Array
     std_px: Array
     warps: Array
-    turns: Array
+    rotation_parts: Array
     stencils: Array
     image_from_reference: Array
     references: References
@@ -128,19 +127,19 @@ class KltFrontEnd:
         kept = believed & valid
         live, predicted, bearings = live.take(kept), predicted[kept], bearings[kept]
         turned = dominant_rotation(live.bearings, bearings) @ live.image_from_reference
-        turns, bends, valid = rotation_warps(self.model, live.stencils, turned, bearings)
+        rotation_parts, second_order, valid = rotation_warps(self.model, live.stencils, turned, bearings)
         seen = register(
             now.coefficients,
             live.references,
             self.shape,
             predicted,
             # what the turn does not explain (approach, slant) is expected to stay as it was
-            turns @ np.linalg.solve(live.turns, live.warps),
+            rotation_parts @ np.linalg.solve(live.rotation_parts, live.warps),
             warp_prior_std=options.warp_prior_std,
         )
         if seen.found.any():
             self.noise = float(np.median(seen.noise[seen.found]))
-        pixels = seen.pixels - drawn_by_bend(live.references, seen.warps, bends)
+        pixels = seen.pixels - registration_bias(live.references, seen.warps, second_order)
         bearings, on_lens = self.model.unproject(pixels)
         stretch = np.linalg.svd(seen.warps, compute_uv=False)
         kept = valid & on_lens & seen.found & inside(usable, pixels)
@@ -152,7 +151,7 @@ class KltFrontEnd:
             bearings,
             seen.std_px,
             seen.warps,
-            turns,
+            rotation_parts,
             live.stencils,
             turned,
             live.references,
@@ -172,7 +171,7 @@ class KltFrontEnd:
             min_distance_px=options.min_distance_px,
             min_strength=(self.noise / options.max_std_px) ** 2,
             last=high,
-            wanted_last=round(options.max_high_share * options.max_features) - _count(high, occupied),
+            wanted_last=round(options.max_high_fraction * options.max_features) - _count(high, occupied),
         )
         stencils, valid = stencil_bearings(self.model, corners)
         bearings, on_lens = self.model.unproject(corners)

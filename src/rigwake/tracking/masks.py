@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from rigwake._types import Array, Mask
 from rigwake.atomic import atomic_path
-from rigwake.cameras.base import CameraModel, Mask
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import InputError, UsageError
-from rigwake.geometry.so3 import Array
 from rigwake.recording import CameraStream
 
 _DARK = 12  # grey levels: what a lens leaves outside its image circle, with stray light and noise

@@ -10,12 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.cameras.base import Mask
+from rigwake._types import Array, Image, Mask
 from rigwake.errors import UsageError
-from rigwake.geometry.so3 import Array
-from rigwake.recording import Image
 from rigwake.tracking.features import balanced
-from rigwake.tracking.options import FrontEndName, MatcherName
+from rigwake.tracking.tracking_options import FrontEndName, MatcherName
 
 Descriptors = NDArray[np.uint8] | NDArray[np.float32]
 

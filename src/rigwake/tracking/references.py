@@ -14,12 +14,9 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from rigwake.cameras.base import Mask
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array, Floats, Mask
 from rigwake.tracking.interpolation import Coefficients, sample_with_gradient
 from rigwake.tracking.small_solve import cholesky_solve
-
-Floats = NDArray[np.float32]
 
 PHOTOMETRIC = 6  # b, b_x, b_y, g_x, g_y, g: the gain itself comes last
 UNKNOWNS = 6  # two of the position, four of the warp
@@ -65,13 +62,13 @@ class References:
         projected out, and then these directions (orthonormal; what T adds to the others comes last).
     information: (N, 6, 6) Gauss-Newton matrix of p and A per unit of gain and noise.
     contrast: (N,) norm of what T adds to the other photometric directions.
-    pulls: (N, 2, 6) how far the fitted position moves by unit bends of the patch, see `drawn_by_bend`.
+    bias_responses: (N, 2, 6) how far the fitted position moves by unit bends of the patch, see `registration_bias`.
     """
 
     pattern: Floats
     information: Array
     contrast: Array
-    pulls: Array
+    bias_responses: Array
 
     def __len__(self) -> int:
         return len(self.contrast)
@@ -98,16 +95,16 @@ def make_references(coefficients: Coefficients, pixels: Array, shape: PatchShape
     return References(*made[:4]), made[4]
 
 
-def drawn_by_bend(references: References, warps: Array, bends: Array) -> Array:
+def registration_bias(references: References, warps: Array, second_order: Array) -> Array:
     """(N, 2) how far patches are found from where they are, because their warp is bent and an affine one is fitted.
 
     Perspective and lens move the sample at offset x from the patch's centre by `A x + b(x)`, b quadratic with the
-    second derivatives `bends` (N, 2, 3), by xx, xy and yy. In the patch's own pixels that is `A^-1 b(x)`; with G
+    second derivatives `second_order` (N, 2, 3), by xx, xy and yy. In the patch's own pixels that is `A^-1 b(x)`; with G
     the slopes of the samples by position and warp, the fit answers with `(G^T G)^-1 G^T g`, g what `A^-1 b` does
     to them. A tenth of a pixel between cameras that look 90 degrees apart, in the same sense for all of them.
     """
-    in_patch = np.linalg.solve(warps, bends).reshape(-1, 6, 1)
-    return np.asarray((warps @ references.pulls @ in_patch)[:, :, 0])
+    in_patch = np.linalg.solve(warps, second_order).reshape(-1, 6, 1)
+    return np.asarray((warps @ references.bias_responses @ in_patch)[:, :, 0])
 
 
 @njit(cache=True, nogil=True)
@@ -119,7 +116,7 @@ def _make_references(
     pattern = np.zeros((n_patches, ROWS, n_samples), np.float32)
     information = np.zeros((n_patches, UNKNOWNS, UNKNOWNS))
     contrast = np.zeros(n_patches)
-    pulls = np.zeros((n_patches, 2, 6))
+    bias_responses = np.zeros((n_patches, 2, 6))
     good = np.zeros(n_patches, np.bool_)
     slopes, basis = np.zeros((UNKNOWNS, n_samples)), np.zeros((PHOTOMETRIC, n_samples))
     bent, factor, answer = np.zeros((6, n_samples)), np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
@@ -136,7 +133,7 @@ def _make_references(
             slopes[0, k], slopes[1, k] = w * by_x, w * by_y
             slopes[2, k], slopes[3, k] = w * by_x * x, w * by_x * y
             slopes[4, k], slopes[5, k] = w * by_y * x, w * by_y * y
-        _bend_slopes(slopes, offsets, bent)
+        _second_order_slopes(slopes, offsets, bent)
         contrast[n] = _orthonormalise(basis)
         if contrast[n] < 1.0:
             continue
@@ -147,15 +144,15 @@ def _make_references(
         for i in range(UNKNOWNS):
             for j in range(UNKNOWNS):
                 information[n, i, j] = _dot(slopes[i], slopes[j])
-        _draw(information[n], slopes, bent, factor, answer, pulls[n])
+        _bias_response(information[n], slopes, bent, factor, answer, bias_responses[n])
         for k in range(n_samples):
             for i in range(ROWS):
                 pattern[n, i, k] = slopes[i, k] if i < UNKNOWNS else basis[i - UNKNOWNS, k]
-    return pattern, information, contrast, pulls, good
+    return pattern, information, contrast, bias_responses, good
 
 
 @register_jitable
-def _bend_slopes(slopes: Array, offsets: Floats, bent: Array) -> None:
+def _second_order_slopes(slopes: Array, offsets: Floats, bent: Array) -> None:
     """Into `bent` (6, K): the samples' derivatives by second derivatives of x and of y by xx, xy and yy."""
     for k in range(len(offsets)):
         x, y = offsets[k, 0], offsets[k, 1]
@@ -166,8 +163,10 @@ def _bend_slopes(slopes: Array, offsets: Floats, bent: Array) -> None:
 
 
 @register_jitable
-def _draw(information: Array, slopes: Array, bent: Array, factor: Array, answer: Array, pull: Array) -> None:
-    """Into `pull` (2, 6): the position fitted to what each of the bends does to the samples."""
+def _bias_response(
+    information: Array, slopes: Array, bent: Array, factor: Array, answer: Array, bias_response: Array
+) -> None:
+    """Into `bias_response` (2, 6): the position fitted to what each of the bends does to the samples."""
     ridge = 0.0
     for i in range(UNKNOWNS):
         ridge += 1e-9 * information[i, i]
@@ -178,7 +177,7 @@ def _draw(information: Array, slopes: Array, bent: Array, factor: Array, answer:
                 factor[i, j] = information[i, j]
             factor[i, i] += ridge
         if cholesky_solve(factor, answer):
-            pull[0, c], pull[1, c] = answer[0], answer[1]
+            bias_response[0, c], bias_response[1, c] = answer[0], answer[1]
 
 
 @register_jitable

@@ -21,12 +21,11 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from rigwake.cameras.base import Mask
-from rigwake.geometry.so3 import Array
-from rigwake.threads import over_ranges, ranges
+from rigwake._types import Array, Floats, Mask
+from rigwake.parallel import over_ranges, ranges
 from rigwake.tracking.interpolation import Coefficients, sample
 from rigwake.tracking.klt import SUMS_IN_ANY_ORDER
-from rigwake.tracking.references import PHOTOMETRIC, ROWS, UNKNOWNS, Floats, PatchShape, References
+from rigwake.tracking.references import PHOTOMETRIC, ROWS, UNKNOWNS, PatchShape, References
 from rigwake.tracking.small_solve import cholesky_solve, position_spread
 
 Entries = tuple[float, float, float, float]

@@ -7,7 +7,7 @@ from math import sqrt
 import numpy as np
 from numba.extending import register_jitable
 
-from rigwake.geometry.so3 import Array
+from rigwake._types import Array
 
 
 @register_jitable(inline="always")

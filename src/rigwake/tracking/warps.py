@@ -12,9 +12,9 @@ from math import sqrt
 import numpy as np
 from numba import njit
 
-from rigwake.cameras.base import CameraModel, Mask
+from rigwake._types import Array, Mask
+from rigwake.cameras.protocol import CameraModel
 from rigwake.geometry import so3
-from rigwake.geometry.so3 import Array
 
 _STENCIL_PX = 2.0
 _STENCIL = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [0, 0]]) * _STENCIL_PX
@@ -88,13 +88,13 @@ def rotation_warps(
     pixels = pixels.reshape(len(stencils), -1, 2)
     right, left, below, above, lower_right, upper_left, centre = pixels.transpose(1, 0, 2)
     warps = np.stack([right - left, below - above], axis=2) / (2 * _STENCIL_PX)
-    bend_xx, bend_yy = right + left - 2 * centre, below + above - 2 * centre
-    bend_xy = (lower_right + upper_left - 2 * centre - bend_xx - bend_yy) / 2
-    bends = np.stack([bend_xx, bend_xy, bend_yy], axis=2) / _STENCIL_PX**2
+    second_xx, second_yy = right + left - 2 * centre, below + above - 2 * centre
+    second_xy = (lower_right + upper_left - 2 * centre - second_xx - second_yy) / 2
+    second_order = np.stack([second_xx, second_xy, second_yy], axis=2) / _STENCIL_PX**2
     good = np.asarray(valid.reshape(len(stencils), -1).all(axis=1))
     warps[~good] = np.eye(2)
-    bends[~good] = 0.0
-    return warps, bends, good
+    second_order[~good] = 0.0
+    return warps, second_order, good
 
 
 def _smallest_rotation(before: Array, after: Array) -> Array:

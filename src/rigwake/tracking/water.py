@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake.cameras.base import CameraModel, Mask
-from rigwake.geometry.so3 import Array
-from rigwake.recording import Image
+from rigwake._types import Array, Image, Mask
+from rigwake.cameras.protocol import CameraModel
 from rigwake.tracking.masks import pixel_grid
 
 _SMOOTH = 6  # grey levels between neighbours, after a little blur

@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 import yaml
 
-from rigwake.cameras.base import CameraModel
-from rigwake.cameras.catalogue import camera_to_dict
+from rigwake.cameras.protocol import CameraModel
+from rigwake.cameras.registry import camera_to_dict
 from rigwake.errors import UsageError
 from rigwake.geometry import so3
 from rigwake.geometry.geodesy import lla_from_enu
 from rigwake.geometry.se3 import SE3
 from rigwake.recording import AttitudeStream, CameraStream, Finding, GnssStream, ImuStream, Recording
 from rigwake.rig import Rig
-from rigwake.writers.ros_messages import encode_image
+from rigwake.writers.ros_encoding import encode_image
 from rigwake.writers.rosbag import is_grey
-from rigwake.writers.trajectories import write_tum
+from rigwake.writers.trajectory_writer import write_tum
 
 IMU_HEADER = "timestamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
 _UPPER = np.triu_indices(3)

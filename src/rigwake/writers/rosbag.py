@@ -16,15 +16,16 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
+from rigwake._types import Image
 from rigwake.atomic import atomic_path
-from rigwake.cameras.ros import CameraInfo, info_from_camera
+from rigwake.cameras.formats.camera_info import CameraInfo, info_from_camera
 from rigwake.errors import CameraError, UsageError
 from rigwake.readers.channels import Encoding
-from rigwake.readers.ros_messages import typestore
+from rigwake.readers.ros_decoding import typestore
 from rigwake.readers.topics import camera_base
-from rigwake.recording import AttitudeStream, CameraStream, Finding, GnssStream, Image, ImuStream, Recording
+from rigwake.recording import AttitudeStream, CameraStream, Finding, GnssStream, ImuStream, Recording
 from rigwake.trajectory import Trajectory
-from rigwake.writers.ros_messages import MessageFactory
+from rigwake.writers.ros_encoding import MessageFactory
 
 ImageEncoding = Literal["jpeg", "png", "raw"]
 NAMESPACE = "/wamv/sensors"

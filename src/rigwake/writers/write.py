@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from rigwake.errors import UsageError
 from rigwake.recording import Finding, Recording
-from rigwake.writers.euroc import write_euroc
+from rigwake.writers.euroc_writer import write_euroc
 from rigwake.writers.folders import write_folder
 from rigwake.writers.rosbag import ImageEncoding, write_rosbag1, write_rosbag2
 

@@ -199,7 +199,7 @@ class View {
     const towards = [ce * ca, ce * sa, se], right = [-sa, ca, 0], up = [-se * ca, -se * sa, ce];
     let across = 1e-6, along = 1e-6;
     for (const part of parts)
-      for (const point of part.doubt ? [] : part.line || part.face || [part.dot || part.text]) {
+      for (const point of part.uncertainty ? [] : part.line || part.face || [part.dot || part.text]) {
         const p = add(point, times(this.scene.middle, -1));
         const shrink = distance / (distance - dot(p, towards));
         across = Math.max(across, Math.abs(dot(p, right)) * shrink);
@@ -259,8 +259,8 @@ function ellipsoid(centre, sigmaAxes, factor, colour) {
         add(centre, add(times(sigmaAxes[i], factor * Math.cos(t)), times(sigmaAxes[j], factor * Math.sin(t))))
       );
     }
-    parts.push({ face: ring, colour, alpha: 0.12, doubt: true });
-    parts.push({ line: ring, colour, alpha: 0.8, width: 1, doubt: true });
+    parts.push({ face: ring, colour, alpha: 0.12, uncertainty: true });
+    parts.push({ line: ring, colour, alpha: 0.8, width: 1, uncertainty: true });
   }
   return parts;
 }
@@ -278,7 +278,7 @@ function rigParts() {
     const colour = colourOf(index), open = camera.position.includes(null) || !camera.frustum;
     const at = camera.position.map((x) => x ?? 0);
     parts.push({ dot: at, colour, radius: 3.5 });
-    const words = open ? camera.name + " (not determined)" : camera.name;
+    const words = open ? camera.name + " (unobservable)" : camera.name;
     parts.push({ text: at, words, colour: text, bold: true });
     for (const direction of camera.open) {
       const reach = times(direction, rig.extent * 0.45);

@@ -1,0 +1,1 @@
+"""Camera parameters in the files and messages of other tools."""

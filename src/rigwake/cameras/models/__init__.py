@@ -1,0 +1,1 @@
+"""Camera models: projection, unprojection and their derivatives."""

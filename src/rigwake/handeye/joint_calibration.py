@@ -1,0 +1,157 @@
+"""`calibrate_handeye`: from trajectories to mountings, with uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rigwake._types import Array
+from rigwake.calibration.rig_calibration import CalibratedCamera, UnobservableDirection
+from rigwake.errors import EstimationError, UnobservableError
+from rigwake.geometry.se3 import SE3
+from rigwake.handeye.handeye_problem import HandeyeProblem, pose_problem
+from rigwake.handeye.handeye_result import HandeyeOptions, HandeyeResult
+from rigwake.handeye.information import USEFUL_LOG_SCALE, USEFUL_TIME_OFFSET
+from rigwake.handeye.initial_mounting import initial_mountings
+from rigwake.handeye.likelihood import HandeyeEstimate, maximise
+from rigwake.handeye.motions import Mounting
+from rigwake.handeye.noise_selection import without_drift
+from rigwake.handeye.observability import covariance, unobservable_directions
+from rigwake.handeye.thesis_handeye import thesis_handeye
+from rigwake.sync import MIN_OVERLAP, estimate_time_offset
+from rigwake.trajectory import Trajectory
+
+
+def calibrate_handeye(
+    reference: Trajectory, members: Sequence[Trajectory], options: HandeyeOptions | None = None
+) -> HandeyeResult:
+    """Where every member sits on the reference, from nothing but their trajectories.
+
+    The trajectories may have any origin, rate and clock; members may be up to scale. All members are solved
+    together, so that loops through them close exactly.
+
+    Raises UsageError (names, a reference up to scale), UnobservableError (nothing of a member is determined,
+    or its clock cannot be aligned), EstimationError (no convergence).
+    """
+    options = options or HandeyeOptions()
+    offsets = [_time_offset(reference, member) if options.time_offset else None for member in members]
+    problem = pose_problem(reference, members, options, [offset is not None for offset in offsets])
+    start = initial_mountings(problem, [offset or 0.0 for offset in offsets])
+    if options.method == "thesis":
+        return _thesis_result(problem, start)
+    estimate = maximise(problem, start, options)
+    if problem.noise == "estimated":
+        problem, estimate = without_drift(problem, estimate, options)
+    if not estimate.converged:
+        raise EstimationError(
+            f"Hand-eye calibration did not settle within {options.max_iterations} steps.",
+            consequence="The motion or the trajectories do not support the model.",
+            remedy="Look at the trajectories: do they show one rigid body? Try --noise poses or increments.",
+        )
+    return _result(problem, estimate, options)
+
+
+def _time_offset(reference: Trajectory, member: Trajectory) -> float | None:
+    """A first offset of the member's clock; None if it cannot be told but both clocks seem to be one."""
+    try:
+        return estimate_time_offset(reference, member).offset_s
+    except UnobservableError:
+        shared = min(reference.timestamps_ns[-1], member.timestamps_ns[-1]) - max(
+            reference.timestamps_ns[0], member.timestamps_ns[0]
+        )
+        if shared * 1e-9 < MIN_OVERLAP * min(reference.duration_s, member.duration_s):
+            raise
+        return None
+
+
+def _result(problem: HandeyeProblem, estimate: HandeyeEstimate, options: HandeyeOptions) -> HandeyeResult:
+    total = covariance(problem, estimate)
+    reference = problem.reference.trajectory
+    rotations = problem.reference.increments[:, :3]
+    members, raw, scales, spread = {}, {}, {}, {}
+    columns = [at.start + i for at in problem.columns for i in range(6)]
+    for m, (curve, layout, at) in enumerate(
+        zip(problem.members, problem.layouts, problem.columns, strict=True)
+    ):
+        name, mounting = curve.trajectory.name, estimate.mountings[m]
+        block = total[at, at]
+        valid = estimate.valid[:, m]
+        spread[name] = estimate.residuals[m][valid].std(axis=0)
+        stds = np.sqrt(np.diag(block)[layout.scales])
+        known = np.where(stds < USEFUL_LOG_SCALE, 1.0, np.nan)
+        values = np.exp(mounting.log_scales[: layout.scale_count])
+        scales[name] = np.stack([values * known, values * stds * known], axis=1)
+        time_offset_std = float(np.sqrt(np.diag(block)[layout.time_offset].sum()))
+        time_offset_known = layout.has_time_offset and time_offset_std < USEFUL_TIME_OFFSET
+        raw[name] = mounting.ref_from_member
+        single = layout.scale_count == 1
+        members[name] = CalibratedCamera(
+            name,
+            mounting.ref_from_member,
+            block[:6, :6],
+            unobservable=_checked_directions(problem, m, mounting.ref_from_member, block, rotations),
+            time_offset_s=mounting.time_offset_s if time_offset_known else None,
+            time_offset_std_s=time_offset_std if time_offset_known else None,
+            scale=float(scales[name][0, 0]) if single else None,
+            scale_std=float(scales[name][0, 1]) if single else None,
+            statistics={"steps": int(valid.sum())},
+        )
+    return HandeyeResult(
+        reference.name,
+        members,
+        raw,
+        total[np.ix_(columns, columns)],
+        scales,
+        _noise_words(problem),
+        spread,
+        int(estimate.equations.used.sum()),
+        int(np.sum(estimate.equations.weights < 1)),
+        estimate.iterations,
+        estimate.converged,
+    )
+
+
+def _checked_directions(
+    problem: HandeyeProblem, m: int, X: SE3, block: Array, rotations: Array
+) -> tuple[UnobservableDirection, ...]:
+    reference, name = problem.reference.trajectory.name, problem.members[m].trajectory.name
+    found = unobservable_directions(reference, name, X, block[:6, :6], rotations)
+    if len(found) == 6:
+        raise UnobservableError(
+            f"The motion determines nothing of how {name} sits on {reference}.",
+            consequence="They stood still, or moved by less than the noise of their trajectories.",
+            remedy="Record a minute of turning through at least 60 degrees, to both sides, in waves if possible.",
+        )
+    return found
+
+
+def _noise_words(problem: HandeyeProblem) -> str:
+    source = "as declared" if problem.has_known_noise else "levels learnt from the residuals"
+    return f"{problem.noise}, {source}"
+
+
+def _thesis_result(problem: HandeyeProblem, start: Sequence[Mounting]) -> HandeyeResult:
+    reference, sampled = problem.sampled(start)
+    raw, members = {}, {}
+    unknown = np.full((6, 6), np.nan)
+    parts = zip(problem.members, problem.layouts, sampled, start, strict=True)
+    for curve, layout, member, mounting in parts:
+        name = curve.trajectory.name
+        both = (reference.segments >= 0) & (member.segments >= 0)
+        raw[name] = thesis_handeye(reference.world_from_body[both], member.world_from_body[both])
+        offset = mounting.time_offset_s if layout.has_time_offset else None
+        members[name] = CalibratedCamera(name, raw[name], unknown, time_offset_s=offset)
+    return HandeyeResult(
+        problem.reference.trajectory.name,
+        members,
+        raw,
+        np.full((6 * len(raw), 6 * len(raw)), np.nan),
+        {name: np.zeros((0, 2)) for name in raw},
+        "ignored",
+        {name: np.full(6, np.nan) for name in raw},
+        len(reference.segments),
+        0,
+        1,
+        True,
+    )

@@ -1,0 +1,163 @@
+"""Is this recording enough to calibrate, and if not, what to do differently."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from rigwake.inspection.recording_inspection import Inspection
+
+Word = Literal["enough", "partly", "not enough"]
+
+# What each part of a rig needs from the motion. Horizontal offsets and headings come from turning, vertical
+# offsets from rolling and pitching: with a standard deviation s of tilt they are determined 1/s times worse than
+# the horizontal ones, so that below half a degree they drown.
+MIN_TURNING_DEG = 60.0
+MIN_TILT_STD_DEG = 0.5
+GOOD_TILT_STD_DEG = 1.0
+MIN_PATH_M = 5.0
+MAX_STILL = 0.7
+MIN_CAMERA_HZ = 3.0
+MIN_SECONDS = 10.0
+
+
+@dataclass(frozen=True)
+class Check:
+    """One requirement. `passed` is None where the recording cannot tell. `remedy`: what to do differently."""
+
+    name: str
+    passed: bool | None
+    is_vital: bool
+    measured: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class Readiness:
+    """The word: `enough`; `partly` (calibrates, but not everything); `not enough`. And why."""
+
+    word: Word
+    summary: str
+    checks: tuple[Check, ...]
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What to do differently, most important first."""
+        failed = sorted(
+            (c for c in self.checks if c.passed is not True), key=lambda c: (not c.is_vital, c.name)
+        )
+        return tuple(dict.fromkeys(c.remedy for c in failed if c.remedy))
+
+
+def judge(inspection: Inspection) -> Readiness:
+    """Judge a recording by its sensors and its motion."""
+    checks = (*_sensor_checks(inspection), *_motion_checks(inspection))
+    failed = [c for c in checks if c.passed is False]
+    unknown = [c for c in checks if c.passed is None]
+    if any(c.is_vital for c in failed):
+        names = ", ".join(c.name for c in failed if c.is_vital)
+        return Readiness("not enough", f"Not enough to calibrate: {names}.", checks)
+    if failed or any(c.is_vital for c in unknown):
+        names = ", ".join(c.name for c in (*failed, *unknown))
+        return Readiness("partly", f"Enough to calibrate, with reserve: {names}.", checks)
+    return Readiness("enough", "Enough to calibrate.", checks)
+
+
+def _sensor_checks(inspection: Inspection) -> list[Check]:
+    recording = inspection.recording
+    cameras = recording.cameras
+    unlensed = [name for name, camera in cameras.items() if camera.model is None]
+    others = [*recording.imus, *recording.gnss, *recording.poses]
+    slow = [
+        name
+        for name in cameras
+        if not inspection.timings[f"camera.{name}"].rate_hz >= MIN_CAMERA_HZ
+        or inspection.timings[f"camera.{name}"].duration_s < MIN_SECONDS
+    ]
+    broken = [
+        f.sensor for f in inspection.findings if f.severity == "error" and f.sensor.startswith("camera.")
+    ]
+    broken = list(dict.fromkeys(broken))
+    metric = bool(recording.gnss or recording.imus) or any(t.is_metric for t in recording.poses.values())
+    return [
+        Check(
+            "cameras",
+            len(cameras) >= 2 or (len(cameras) == 1 and bool(others)),
+            True,
+            f"{len(cameras)} cameras",
+            "Record at least two cameras, or one with an IMU, GNSS or poses.",
+        ),
+        Check(
+            "intrinsics",
+            not unlensed,
+            True,
+            f"missing for {', '.join(unlensed)}" if unlensed else "known for every camera",
+            "Give intrinsics: record camera_info, or calibrate each lens with `rigwake intrinsics`.",
+        ),
+        Check(
+            "frame rate and length",
+            not slow,
+            True,
+            f"too slow or short: {', '.join(slow)}" if slow else "every camera long and fast enough",
+            f"Record for at least {MIN_SECONDS:.0f} s (a minute or two is best), at {MIN_CAMERA_HZ:.0f} Hz or more.",
+        ),
+        Check(
+            "pictures",
+            not broken,
+            True,
+            f"errors in {', '.join(broken)}" if broken else "sampled frames are fine",
+            "Look at the findings: frames that cannot be read, black or frozen cameras.",
+        ),
+        Check(
+            "metric scale",
+            metric,
+            False,
+            "an IMU, GNSS or metric poses" if metric else "no sensor that measures metres",
+            "Record GNSS or an IMU: without, all offsets are known up to one common scale.",
+        ),
+    ]
+
+
+def _motion_checks(inspection: Inspection) -> list[Check]:
+    turn, path = inspection.turning, inspection.travel
+    turn_remedy = (
+        f"Turn through at least {MIN_TURNING_DEG:.0f} deg, to both sides: a figure of eight is best."
+    )
+    tilt_remedy = (
+        "Record where waves roll and pitch the boat, or shift weight on board; else measure the heights of the "
+        "cameras with a tape, for calm water does not tell them."
+    )
+    if turn is None:
+        checks = [
+            Check("turning", None, True, "unknown without an IMU", turn_remedy),
+            Check("rolling and pitching", None, False, "unknown without an IMU", tilt_remedy),
+        ]
+    else:
+        major, minor = turn.tilt_std_deg
+        checks = [
+            Check(
+                "turning",
+                turn.turned_deg >= MIN_TURNING_DEG,
+                True,
+                f"{turn.turned_deg:.0f} deg in all, net {turn.net_deg:.0f} deg",
+                turn_remedy,
+            ),
+            Check(
+                "rolling and pitching",
+                major >= GOOD_TILT_STD_DEG and minor >= MIN_TILT_STD_DEG,
+                False,
+                f"tilt varies by {major:.1f} and {minor:.1f} deg (1 sigma)",
+                tilt_remedy,
+            ),
+        ]
+    still = path.still_fraction if path is not None else None
+    moved = None if path is None else path.path_m >= MIN_PATH_M and (still or 0.0) <= MAX_STILL
+    measured = (
+        "unknown without GNSS"
+        if path is None
+        else f"{path.path_m:.0f} m, {100 * path.still_fraction:.0f} % standing"
+    )
+    remedy = (
+        f"Keep moving: at least {MIN_PATH_M:.0f} m under way, not more than {100 * MAX_STILL:.0f} % standing."
+    )
+    return [*checks, Check("path", moved, False, measured, remedy)]

@@ -1,0 +1,203 @@
+"""OUT/report.html: one file, no network, nothing but what stands in the folder."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from rigwake import __version__
+from rigwake._types import Array
+from rigwake.atomic import write_text_atomic
+from rigwake.calibration.yaml_file import plain
+from rigwake.report.charts import Series, arrow_scale, image_map, line_chart, top_view
+from rigwake.report.content import RIG_TRAJECTORY, ReportContent, load_report_content
+from rigwake.report.extrinsics import directions, number, overview, plus_minus, time_offset, two_digits
+from rigwake.report.motion_figures import MotionFigures, motion_of, paths_in_one_world
+from rigwake.report.picture_overlays import embed_pictures, mask_uri
+from rigwake.report.report_verdict import judge
+from rigwake.report.scene import path_scene, rig_scene
+
+
+def build_report(source: ReportContent | Path | str) -> Path:
+    """Write `report.html` into the folder of a calibration and return its path; InputError without calibration.
+
+    source: the folder, or what was read from it.
+    """
+    content = source if isinstance(source, ReportContent) else load_report_content(source)
+    path = content.folder / "report.html"
+    write_text_atomic(path, render(content))
+    return path
+
+
+def render(content: ReportContent) -> str:
+    """The whole page."""
+    return _environment().get_template("report.html.j2").render(_values(content))
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    # names come from recordings: everything is escaped unless it is Markup made here
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("rigwake.report", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["number"] = number
+    environment.filters["plus_minus"] = plus_minus
+    environment.globals["image_map"] = image_map
+    environment.globals["arrow_scale"] = arrow_scale
+    environment.globals["mask_uri"] = mask_uri
+    environment.globals["zip"] = zip
+    return environment
+
+
+def _values(content: ReportContent) -> dict[str, Any]:
+    calibration = content.calibration
+    names = dict.fromkeys([*calibration.cameras, *content.tracks, *content.masks])  # also those given up
+    colours = {name: index for index, name in enumerate(names)}
+    paths = paths_in_one_world(content.trajectories, RIG_TRAJECTORY)
+    rig = content.trajectories.get(RIG_TRAJECTORY)
+    motion = motion_of(rig) if rig is not None else None
+    embedded, unreadable = embed_pictures(content.pictures)
+    scenes = {"rig": rig_scene(calibration), "paths": path_scene(paths, colours)}
+    return {
+        "version": __version__,
+        "css": _asset("report.css"),
+        "js": _asset("report.js"),
+        "scenes": _json(scenes),
+        "content": content,
+        "calibration": calibration,
+        "colours": colours,
+        "verdict": judge(calibration),
+        "rows": overview(calibration),
+        "directions": {name: directions(camera) for name, camera in calibration.cameras.items()},
+        "offsets": [time_offset(camera) for camera in calibration.cameras.values()],
+        "sigma_rows": _sigma_rows(content),
+        "charts": _charts(content, motion, paths, colours),
+        "motion": motion,
+        "pictures": embedded,
+        "unreadable": unreadable,
+        "checks": plain(calibration.checks),
+        "provenance": plain(calibration.provenance),
+        "steps": _first_guess(content),
+        "statistics": {name: plain(c.statistics) for name, c in calibration.cameras.items() if c.statistics},
+        "statistic_names": list(
+            dict.fromkeys(key for c in calibration.cameras.values() for key in c.statistics)
+        ),
+    }
+
+
+def _asset(name: str) -> Markup:
+    return Markup(resources.files("rigwake.report").joinpath("assets", name).read_text(encoding="utf-8"))
+
+
+def _json(value: Any) -> Markup:
+    """JSON that cannot end the script element it stands in."""
+    text = json.dumps(plain(value), separators=(",", ":"), allow_nan=False)
+    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
+
+
+def _first_guess(content: ReportContent) -> dict[str, tuple[Array, Array]]:
+    """Per camera the position (metres) of the initial guess and of the result, in the frame of the initial guess."""
+    first, result = content.initial, content.calibration
+    if first is None:
+        return {}
+    pairs = {
+        name: (c.rig_from_cam, result.cameras[name].rig_from_cam)
+        for name, c in first.cameras.items()
+        if name in result.cameras
+    }
+    if first.reference == result.reference:
+        return {name: (a.translation, b.translation) for name, (a, b) in pairs.items()}
+    if first.reference not in result.cameras:
+        return {}
+    first_from_rig = result.cameras[first.reference].rig_from_cam.inverse()
+    return {name: (a.translation, (first_from_rig * b).translation) for name, (a, b) in pairs.items()}
+
+
+_SIGMA_FLOOR, _SIGMA_CEILING = 1e-4, 1.0  # degrees and metres alike: the ends of the bars
+
+
+def _sigma_rows(content: ReportContent) -> list[tuple[str, list[tuple[str, float | None]]]]:
+    """Per camera six standard deviations as text and as the length (percent) of a logarithmic bar."""
+    rows = []
+    for name, camera in content.calibration.cameras.items():
+        cells: list[tuple[str, float | None]] = []
+        observable = camera.observable_axes
+        values = np.concatenate([camera.std_rotation_deg, camera.std_translation_m])
+        for axis, value in enumerate(values.tolist()):
+            if not observable[axis]:
+                cells.append(("unobservable", None))
+            elif not np.isfinite(value):
+                cells.append(("unknown", None))
+            else:
+                text = f"{two_digits(value)}°" if axis < 3 else f"{two_digits(1e3 * value)} mm"
+                span = np.log(max(value, _SIGMA_FLOOR) / _SIGMA_FLOOR) / np.log(_SIGMA_CEILING / _SIGMA_FLOOR)
+                cells.append((text, float(np.clip(100 * span, 1, 100))))
+        rows.append((name, cells))
+    return rows
+
+
+def _charts(
+    content: ReportContent,
+    motion: MotionFigures | None,
+    paths: dict[str, np.ndarray],
+    colours: dict[str, int],
+) -> dict[str, Markup]:
+    residuals, tracks = content.residuals, content.tracks
+    charts = {
+        "angle": line_chart(
+            "Residuals against the angle from the optical axis",
+            "angle from the axis, degrees",
+            "median, px",
+            [
+                Series(n, r.over_angle.at, r.over_angle.median, colours.get(n, 0))
+                for n, r in residuals.items()
+            ],
+        ),
+        "time": line_chart(
+            "Residuals over time",
+            "time, s",
+            "median, px",
+            [Series(n, r.over_time.at, r.over_time.median, colours.get(n, 0)) for n, r in residuals.items()],
+        ),
+        "tracks": line_chart(
+            "Tracked points per frame",
+            "time, s",
+            "points",
+            [Series(n, t.per_frame_at_s, t.per_frame, colours.get(n, 0)) for n, t in tracks.items()],
+        ),
+        "top": top_view(
+            "Paths seen from above",
+            [Series(n, p[:, 0], p[:, 1], colours.get(n, 7)) for n, p in reversed(list(paths.items()))],
+        ),
+    }
+    if motion is not None:
+        yaw, pitch, roll = motion.yaw_pitch_roll_deg.T
+        charts["yaw"] = line_chart(
+            "Heading over time",
+            "time, s",
+            "heading, deg",
+            [Series("yaw", motion.at_s, yaw, 0)],
+            from_zero=False,
+        )
+        charts["tilt"] = line_chart(
+            "Roll and pitch over time",
+            "time, s",
+            "roll, pitch, deg",
+            [Series("roll", motion.at_s, roll, 0), Series("pitch", motion.at_s, pitch, 1)],
+            from_zero=False,
+        )
+        charts["speed"] = line_chart(
+            "Speed over time", "time, s", "speed, m/s", [Series("speed", motion.at_s, motion.speed, 0)]
+        )
+    return charts

@@ -1,0 +1,95 @@
+"""How a camera turns, from image to image, before anything else is known about it.
+
+A few corners, the rotation most of them agree on, nothing kept: enough to find out how camera and IMU are turned
+towards each other and by how much their clocks differ, and so where the horizon is, before tracking starts.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from rigwake._types import Array, Image, Mask
+from rigwake.cameras.protocol import CameraModel
+from rigwake.errors import EstimationError, UsageError
+from rigwake.geometry.se3 import SE3
+from rigwake.parallel import in_order
+from rigwake.recording import CameraStream, Frame
+from rigwake.tracking.features import detect_corners
+from rigwake.tracking.klt import follow, pyramid
+from rigwake.tracking.masks import beyond_lens
+from rigwake.tracking.warps import dominant_rotation
+from rigwake.trajectory import Trajectory
+
+_CORNERS = 120
+_MIN_MATCHES = 12
+_WINDOW_PX, _LEVELS = 21, 4  # of the search
+_MAX_GAP_S = 0.5
+
+
+def visual_rotations(stream: CameraStream, *, frames: int = 150) -> Trajectory:
+    """A trajectory whose rotations are the camera's turns, and whose positions are all zero.
+
+    frames: at most so many, in a row, from the middle of the recording. It drifts by degrees, and points on the
+    hull or on water pull it a little: good to a degree, not to be calibrated from. Segments end where images
+    show too little. Raises UsageError without a model, EstimationError when hardly any image can be compared.
+    """
+    if stream.model is None:
+        raise UsageError(
+            f"camera {stream.name} has no intrinsics.", remedy="Calibrate one with `rigwake intrinsics`."
+        )
+    count = min(frames, len(stream))
+    start = (len(stream) - count) // 2
+    usable = ~beyond_lens(stream.model)
+    stamps: list[int] = []
+    rotations, segments = [np.eye(3)], [0]
+    pairs = pairwise(stream.frames(np.arange(start, start + count)))
+    for before_ns, after_ns, turn in in_order(partial(_turn, model=stream.model, usable=usable), pairs):
+        rotations.append(rotations[-1] @ (np.eye(3) if turn is None else turn.T))
+        segments.append(segments[-1] + (turn is None))
+        stamps += [after_ns] if stamps else [before_ns, after_ns]
+    if len(stamps) - len(set(segments)) < _MIN_MATCHES:
+        raise EstimationError(
+            f"camera {stream.name}: hardly any two images could be compared.",
+            remedy="Look at the images: black, covered, or at too low a rate?",
+        )
+    matrices = np.array(rotations)
+    return Trajectory(
+        stream.name,
+        np.array(stamps, dtype=np.int64),
+        SE3(matrices, np.zeros((len(stamps), 3))),
+        segment_ids=np.array(segments, dtype=np.int64),
+    )
+
+
+def _turn(pair: tuple[Frame, Frame], model: CameraModel, usable: Mask) -> tuple[int, int, Array | None]:
+    """Stamps of two frames, and the rotation `after_from_before` (3, 3) that most corners agree on; None with too few
+    of them, and across a gap."""
+    before, after = pair
+    near = (after.timestamp_ns - before.timestamp_ns) * 1e-9 <= _MAX_GAP_S
+    turn = _rotation(before.image, after.image, model, usable) if near else None
+    return before.timestamp_ns, after.timestamp_ns, turn
+
+
+def _rotation(before: Image, after: Image, model: CameraModel, usable: Mask) -> Array | None:
+    corners = detect_corners(
+        before,
+        usable,
+        np.empty((0, 2)),
+        wanted=_CORNERS,
+        cell_px=64,
+        min_distance_px=12,
+        min_strength=400.0,
+    )
+    scales, later = (pyramid(image, _WINDOW_PX, _LEVELS) for image in (before, after))
+    landed, believed = follow(
+        scales, later, corners, corners, window_px=_WINDOW_PX, max_forward_backward_px=0.5
+    )
+    bearings_before, valid = model.unproject(corners)
+    bearings_after, still_valid = model.unproject(landed)
+    good = believed & valid & still_valid
+    if good.sum() < _MIN_MATCHES:
+        return None
+    return dominant_rotation(bearings_before[good], bearings_after[good])
