@@ -1,4 +1,5 @@
-"""The rig of recordings with known truth, by method: thesis pipeline, hand-eye only, without and with cross-camera association.
+"""The rig of recordings with known truth, by method: thesis pipeline, hand-eye only, rig bundle adjustment
+without and with cross-camera association.
 
     python benchmarks/calibrate.py [--peers] [RECORDING TRUTH]...
 
@@ -56,7 +57,7 @@ def row(name: str, method: str, found: Calibration | str, truth: Rig, used: str)
 
 
 def seed_pipeline(recording: Path, out: Path) -> Calibration | str:
-    """Frame-to-frame odometry of every camera's tracks, put into metres by GNSS, then the thesis baseline's hand-eye."""
+    """Frame-to-frame odometry of every camera's tracks, put into metres by GNSS, then the thesis hand-eye."""
     opened = open_recording(recording)
     gnss = next(iter(opened.gnss.values()), None)
     try:

@@ -131,7 +131,7 @@ def calibrated(
     trajectories: Mapping[str, Trajectory] | None = None,
     prior: RigPrior | None = None,
 ) -> Calibrated:
-    """From tracks to a rig, as `rigwake calibrate` does it, without landmarks associated across cameras (they need images)."""
+    """From tracks to a rig, as `rigwake calibrate` does it, without cross-camera association (it needs images)."""
     config = load_config(None, ("adjustment.cross_camera=false", *settings))
     recording: Recording = world.recording
     selection = select(recording, config)

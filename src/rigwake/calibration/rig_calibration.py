@@ -17,7 +17,7 @@ from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
 from rigwake.rig import Rig, RigCamera
 
 AXIS_NAMES = ("rotation x", "rotation y", "rotation z", "translation x", "translation y", "translation z")
-_TOUCHES = 0.02  # an axis is undetermined when an undetermined direction has at least this component along it
+_TOUCHES = 0.02  # an axis is unobservable when an unobservable direction has at least this component along it
 
 
 @dataclass(frozen=True, eq=False)

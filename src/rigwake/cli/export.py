@@ -41,7 +41,7 @@ def command(
     allow_unobservable: Annotated[
         bool,
         typer.Option(
-            "--allow-undetermined",
+            "--allow-unobservable",
             help="Leave cameras out that are not fully determined, instead of refusing.",
         ),
     ] = False,

@@ -16,7 +16,7 @@ from rigwake.inspection.inspection_page import inspection_page
 from rigwake.inspection.inspection_summary import inspection_to_dict
 from rigwake.inspection.readiness import Readiness, judge
 from rigwake.inspection.recording_inspection import Inspection, inspect_recording
-from rigwake.inspection.time_offsets import TimeOffset
+from rigwake.inspection.time_offsets import SensorTimeOffset
 from rigwake.readers.open import open_recording
 from rigwake.readers.topics import TopicMap
 
@@ -97,7 +97,7 @@ def _sensor_table(inspection: Inspection) -> Table:
     return table
 
 
-def _time_offset_text(time_offset: TimeOffset | None) -> str:
+def _time_offset_text(time_offset: SensorTimeOffset | None) -> str:
     if time_offset is None:
         return ""
     if time_offset.offset_s is None or time_offset.std_s is None:

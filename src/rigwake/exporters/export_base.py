@@ -71,7 +71,7 @@ def observable_part(calibration: Calibration, allow_unobservable: bool) -> tuple
             f"unobservable: {'; '.join(words)}.",
             consequence="Other programs would take a placeholder for a measurement, so nothing is written.",
             remedy=f"{'; '.join(remedies) or 'Record more motion'}. "
-            "Or give --allow-undetermined, which leaves such cameras out.",
+            "Or give --allow-unobservable, which leaves such cameras out.",
         )
     kept = {name: camera for name, camera in calibration.cameras.items() if name not in lost}
     if not kept:

@@ -52,7 +52,7 @@ class HandeyeResult:
     """Where the members sit, how sure that is, and how the estimate came about.
 
     reference: name. members: by name, parts that the motion left unobservable marked (see CalibratedCamera).
-    ref_from_members: the raw estimates by name; along undetermined directions they are arbitrary.
+    ref_from_members: the raw estimates by name; along unobservable directions they are arbitrary.
     joint_covariance: (6 M, 6 M) right tangents of the members in order.
     scales: by name, one (scale, std) per segment that was scaled; NaN where unobservable.
     noise: what the likelihood assumed, in words. residual_std: by name, (6,) `[rotation, translation]`.

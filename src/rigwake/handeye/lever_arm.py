@@ -36,7 +36,7 @@ _GOLDEN = (math.sqrt(5.0) - 1) / 2
 
 @dataclass(frozen=True)
 class LeverArmLevels:
-    """fraction: part of the rotation's variance that is the reference's. translation: its own variance per axis, m^2."""
+    """fraction: part of the rotation's variance that is the reference's. translation: its variance per axis, m^2."""
 
     fraction: float
     translation: float

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rigwake.inspection.picture_samples import Pictures, look_at_pictures, sampled_indices
-from rigwake.inspection.time_offsets import TimeOffset, camera_offset, gnss_offset
+from rigwake.inspection.time_offsets import SensorTimeOffset, camera_offset, gnss_offset
 from rigwake.inspection.timing import Timing, timing
 from rigwake.inspection.vessel_motion import Travel, Turning, travel, turning
 from rigwake.recording import Finding, GnssStream, ImuStream, Recording
@@ -34,7 +34,7 @@ class Inspection:
     pictures: Mapping[str, Pictures]
     turning: Turning | None
     travel: Travel | None
-    time_offsets: Mapping[str, TimeOffset]
+    time_offsets: Mapping[str, SensorTimeOffset]
     findings: tuple[Finding, ...]
 
 
@@ -82,7 +82,7 @@ def _pictures(recording: Recording, report: Progress) -> dict[str, Pictures]:
 
 def _time_offsets(
     imu: ImuStream | None, gnss: GnssStream | None, pictures: Mapping[str, Pictures]
-) -> dict[str, TimeOffset]:
+) -> dict[str, SensorTimeOffset]:
     if imu is None:
         return {}
     time_offsets = {f"camera.{name}": camera_offset(name, seen, imu) for name, seen in pictures.items()}
@@ -142,7 +142,7 @@ def _imu_findings(recording: Recording) -> list[Finding]:
 
 
 def _time_offset_findings(
-    time_offsets: Mapping[str, TimeOffset], timings: Mapping[str, Timing]
+    time_offsets: Mapping[str, SensorTimeOffset], timings: Mapping[str, Timing]
 ) -> list[Finding]:
     findings = []
     for key, time_offset in time_offsets.items():
@@ -150,6 +150,7 @@ def _time_offset_findings(
             continue
         period_s = 1 / timings[key].rate_hz
         if abs(time_offset.offset_s) > max(0.5 * period_s, 3 * time_offset.std_s):
-            message = f"its clock is {1e3 * time_offset.offset_s:.0f} +- {1e3 * time_offset.std_s:.0f} ms off the IMU's."
+            off_ms, std_ms = 1e3 * time_offset.offset_s, 1e3 * time_offset.std_s
+            message = f"its clock is {off_ms:.0f} +- {std_ms:.0f} ms off the IMU's."
             findings.append(Finding("warning", key, message))
     return findings

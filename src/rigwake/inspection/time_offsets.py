@@ -21,7 +21,7 @@ _MIN_STRETCHES = 4
 
 
 @dataclass(frozen=True)
-class TimeOffset:
+class SensorTimeOffset:
     """`t_imu = t_sensor + offset_s`, its standard deviation, and the fraction of the motion that agrees there.
 
     offset_s and std_s are None where the motion does not tell; `why` says so.
@@ -34,7 +34,7 @@ class TimeOffset:
     why: str = ""
 
 
-def _refined(lags: Array, squares: Array, times: Array, sensor: str, total: float) -> TimeOffset:
+def _refined(lags: Array, squares: Array, times: Array, sensor: str, total: float) -> SensorTimeOffset:
     """The lag of the least sum of squares, to a fraction of a step.
 
     squares: (lags, samples) squared residuals; times: (samples,). The standard deviation is the larger of what
@@ -44,9 +44,13 @@ def _refined(lags: Array, squares: Array, times: Array, sensor: str, total: floa
     best = int(np.argmin(cost))
     explained = 1 - float(cost[best]) / max(total, 1e-30)
     if explained < _MIN_EXPLAINED:
-        return TimeOffset(sensor, None, None, explained, "its motion does not match the IMU's at any offset")
+        return SensorTimeOffset(
+            sensor, None, None, explained, "its motion does not match the IMU's at any offset"
+        )
     if best in (0, len(lags) - 1):
-        return TimeOffset(sensor, None, None, explained, f"the offset is beyond {abs(lags[best]):.1f} s")
+        return SensorTimeOffset(
+            sensor, None, None, explained, f"the offset is beyond {abs(lags[best]):.1f} s"
+        )
     step = float(lags[1] - lags[0])
     offset, curvature = _parabola(lags, cost)
     std = step * float(np.sqrt(2 * cost[best] / max(squares.shape[1] - 4, 1) / curvature))
@@ -56,7 +60,7 @@ def _refined(lags: Array, squares: Array, times: Array, sensor: str, total: floa
         without = np.array([_parabola(lags, cost - part)[0] for part in parts])
         spread = np.sum((without - without.mean()) ** 2) * (len(parts) - 1) / len(parts)
         std = max(std, float(np.sqrt(spread)))
-    return TimeOffset(sensor, offset, std, explained)
+    return SensorTimeOffset(sensor, offset, std, explained)
 
 
 def _parabola(lags: Array, cost: Array) -> tuple[float, float]:
@@ -81,14 +85,14 @@ def _mean_rates(imu: ImuStream) -> Callable[[Array, Array], Array]:
     return rates
 
 
-def camera_offset(camera: str, pictures: Pictures, imu: ImuStream) -> TimeOffset:
+def camera_offset(camera: str, pictures: Pictures, imu: ImuStream) -> SensorTimeOffset:
     """Offset of a camera's clock: at each lag the rotation and bias that best turn gyro rates into image
     rates are solved (Wahba), and the lag of the smallest residual wins."""
     start, end = (_since(stamps, imu) for stamps in (pictures.start_ns, pictures.end_ns))
     length = (imu.timestamps_ns[-1] - imu.timestamps_ns[0]) * 1e-9
     inside = (start > SEARCH_S) & (end < length - SEARCH_S)
     if inside.sum() < _MIN_PAIRS:
-        return TimeOffset(camera, None, None, 0.0, "too few frames could be compared with the IMU")
+        return SensorTimeOffset(camera, None, None, 0.0, "too few frames could be compared with the IMU")
     start, end = start[inside], end[inside]
     measured = pictures.rotations[inside] / (end - start)[:, None]
     measured = measured - np.median(measured, axis=0)
@@ -115,7 +119,7 @@ def _since(stamps: Stamps, imu: ImuStream) -> Array:
     return np.asarray((stamps - imu.timestamps_ns[0]) * 1e-9)
 
 
-def gnss_offset(gnss: GnssStream, imu: ImuStream) -> TimeOffset:
+def gnss_offset(gnss: GnssStream, imu: ImuStream) -> SensorTimeOffset:
     """Offset of a receiver's clock: second differences of its positions over half a second, against the
     accelerometer's twice integrated over the same.
 
@@ -130,7 +134,7 @@ def gnss_offset(gnss: GnssStream, imu: ImuStream) -> TimeOffset:
     first = max(times[0], imu_times[0] + SEARCH_S) + 2 * _SPAN_S
     last = min(times[-1], imu_times[-1] - SEARCH_S) - 2 * _SPAN_S
     if last - first < 10.0:
-        return TimeOffset(gnss.name, None, None, 0.0, "too short, or not at the time of the IMU")
+        return SensorTimeOffset(gnss.name, None, None, 0.0, "too short, or not at the time of the IMU")
     step = max(float(np.median(np.diff(times))), 0.1)
     lags = np.arange(-SEARCH_S, SEARCH_S + 1e-9, 0.02)
     inertial = _InertialPath.of(imu)

@@ -41,7 +41,7 @@ class IntrinsicCalibration:
     """A calibrated camera: answer and uncertainty.
 
     camera: the lens. covariance: (P, P) of `camera.params`; zero for fixed parameters, infinite on the
-    diagonal of undetermined ones. fixed, unobservable: names of parameters. cam_from_board: pose per kept view.
+    diagonal of unobservable ones. fixed, unobservable: names of parameters. cam_from_board: pose per kept view.
     view_names: kept views. residuals_px: (N, 2) projected minus observed, corners (N): what was seen, with
     `used` false for dropped corners. sigma_px: standard deviation of a pixel coordinate, from the residuals.
     rms_px: root mean square distance of used corners. dropped_views: names and reasons.
@@ -68,7 +68,7 @@ class IntrinsicCalibration:
 
     @property
     def stds(self) -> dict[str, float]:
-        """Standard deviation by parameter name; zero if fixed, infinite if undetermined."""
+        """Standard deviation by parameter name; zero if fixed, infinite if unobservable."""
         values = np.sqrt(np.diag(self.covariance)).tolist()
         return dict(zip(self.camera.param_names, values, strict=True))
 

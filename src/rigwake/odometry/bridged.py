@@ -72,8 +72,8 @@ def _moving(tracks: Tracks, camera: CameraModel, visual: OdometryResult) -> list
     rows, at = rows[order], at[order]
     _, track = np.unique(name[order], axis=0, return_inverse=True)
     judged = np.bincount(track) >= _MOVING_VIEWS
-    doubtful = judged & (np.bincount(track, weights=visual.inliers[rows]) == 0)
-    taken = doubtful[track]
+    unsupported = judged & (np.bincount(track, weights=visual.inliers[rows]) == 0)
+    taken = unsupported[track]
     moving = _fits_nothing_standing(
         tracks, camera, path.world_from_body, rows[taken], at[taken], track[taken]
     )

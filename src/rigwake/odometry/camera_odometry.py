@@ -210,7 +210,7 @@ class _OdometryRun:
         if lens is not None:
             self.notes.append(
                 f"the intrinsics given do not fit the images: distortion and principal point were refined by "
-                f"{lens.shift_px:.1f} px (RMS), which takes away {100 * lens.gain:.0f} % of the bundle adjustment's cost"
+                f"{lens.shift_px:.1f} px (RMS), which takes away {100 * lens.gain:.0f} % of the cost"
             )
         return visual, lens
 

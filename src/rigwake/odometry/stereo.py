@@ -135,7 +135,7 @@ def estimate_stereo(
     order = np.lexsort((tracks.track_ids, tracks.frame_indices))
     tracks = tracks.take(order)
     matches = match_stereo(tracks, first, second, second_from_first)
-    # until the bundle adjustment, points are as uncertain as their disparity, and pixels must not be trusted beyond that
+    # before bundle adjustment, points are as uncertain as their disparity, and pixels must not be trusted beyond that
     loose = replace(tracks, std_px=np.maximum(tracks.std_px, _CHAIN_STD_PX))
     visual_map = VisualMap(index_observations(loose, first.model), options)
     _chain(visual_map, matches, second_from_first)

@@ -74,7 +74,7 @@ def estimate_rig(
     """The rig from initial values and what was tracked.
 
     tracks: by camera, of all that `first` knows. prior: the one that `first` was made with. masks: folder of the
-    cameras' masks, for landmarks that are associated across cameras. Images are only read with `config.adjustment.cross_camera`.
+    cameras' masks, for cross-camera association. Images are only read with `config.adjustment.cross_camera`.
 
     Raises UsageError for a reference that is not there, UnobservableError when the motion
     determines nothing, EstimationError when no trustworthy answer was found.
@@ -104,7 +104,7 @@ def _adjust(
     assembled = assemble_problem(measurements, first.start, config.adjustment)
     assembled = replace(assembled, problem=prior.constrained(assembled.problem))
     progress(f"adjusting {len(assembled.problem.observations)} observations", 0.0)
-    adjusted = adjust(assembled, config.adjustment, to_be_continued=config.adjustment.cross_camera)
+    adjusted = adjust(assembled, config.adjustment, final=not config.adjustment.cross_camera)
     if not config.adjustment.cross_camera:
         return adjusted, CrossCameraMatches.nothing()
     return adjust_with_association(

@@ -36,7 +36,7 @@ class PreparedImage:
 class _Live:
     """The N points that are being followed.
 
-    warps: affine, image from reference patch; of these `rotation_parts` is the part that the camera's rotation explains.
+    warps: affine, image from reference patch; of these `rotation_parts` is what the camera's rotation explains.
     stencils, image_from_reference: bearings about the reference pixel, and the camera's rotation since.
     """
 

@@ -26,7 +26,7 @@ _HELD_OUT = 7  # the landmarks of every seventh search are only used to check th
 
 @dataclass(frozen=True, eq=False)
 class CrossCameraMatches:
-    """What was associated across cameras. used: observations that were added. unused: others held out, to check the result."""
+    """What was associated across cameras. used: number of observations added. unused: those held out."""
 
     used: int
     unused: Observations
@@ -64,7 +64,7 @@ def adjust_with_association(
     if level is not free:
         progress("adjusting with cameras held near one height")
         held = AssembledProblem(level, adjusted.track_cameras, adjusted.track_ids)
-        adjusted = adjust(held, replace(options, rounds=1), to_be_continued=True)
+        adjusted = adjust(held, replace(options, rounds=1), final=False)
     for done in range(search.rounds):
         last = done == search.rounds - 1
         problem = adjusted.solution.problem
@@ -88,7 +88,7 @@ def adjust_with_association(
             adjusted.track_ids,
         )
         before = adjusted
-        adjusted = adjust(with_found, replace(options, rounds=2 if last else 1), to_be_continued=not last)
+        adjusted = adjust(with_found, replace(options, rounds=2 if last else 1), final=last)
         used += len(found)
         unused = _renumbered(held_out, before, adjusted)
     return adjusted, CrossCameraMatches(used, unused)

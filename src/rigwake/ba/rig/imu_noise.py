@@ -19,7 +19,8 @@ def imu_noise_scales(solution: RigSolution) -> tuple[float, float]:
     """How much the residuals of gyroscope and accelerometer exceed what their densities predict; 1 or more.
 
     The robust spread of the whitened changes of rotation and of velocity between neighbouring states. Residuals
-    below the assumed values say little, since the states follow the IMU where nothing else holds them: they change nothing.
+    below the assumed values say little, since the states follow the IMU where nothing else holds
+    them: they change nothing.
     """
     problem = solution.problem
     if problem.imu is None or len(problem.states) <= _FEWEST:

@@ -1,7 +1,7 @@
 """Initial values of the rig: from one trajectory per camera, by hand-eye, gyro, accelerometer and GNSS.
 
-One camera is the reference: its trajectory is made metric and put into the world. Hand-eye ties the others to it, all at once;
-gyro and accelerometer tie it to the IMU. Any trajectories will do, whoever estimated them.
+One camera is the reference: its trajectory is made metric and put into the world. Hand-eye ties the others to it,
+all at once; gyro and accelerometer tie it to the IMU. Any trajectories will do, whoever estimated them.
 """
 
 from __future__ import annotations

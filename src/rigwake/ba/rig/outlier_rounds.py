@@ -29,11 +29,11 @@ def adjust(
     options: AdjustmentOptions,
     progress: Callable[[str], None] | None = None,
     *,
-    to_be_continued: bool = False,
+    final: bool = True,
 ) -> AdjustedRig:
     """The rig at its optimum after `options.rounds` of solving and dropping outliers.
 
-    to_be_continued: whether another adjustment starts from this one, so that it need not be exact.
+    final: False if another bundle adjustment starts from this one, so that it need not be exact.
 
     Between rounds an observation beyond the gate is dropped, landmarks left with too few observations go, and
     each camera's `std_px` is scaled to the spread that its residuals show; so are the IMU's densities where
@@ -45,7 +45,7 @@ def adjust(
     dropped = np.zeros(len(problem.cameras), dtype=np.int64)
     for done in range(options.rounds + 1):
         last = done == options.rounds
-        settled = SETTLED if last and not to_be_continued else NEARLY_SETTLED
+        settled = SETTLED if last and final else NEARLY_SETTLED
         solver = replace(settled, loss="cauchy" if done == 0 else "huber")
         if progress is not None:
             progress(f"adjusting the rig, round {done + 1}: {len(problem.observations)} observations")

@@ -173,7 +173,7 @@ def _rows(
 
 
 def _with_unobservable_directions(covariance: RigCovariance, rows: Array) -> Array:
-    """Covariance of `rows @ parameters` in which undetermined directions have a size as good as none."""
+    """Covariance of `rows @ parameters` in which unobservable directions have a size as good as none."""
     half = covariance.spread(rows)
     joint = half @ half.T
     lost = rows @ covariance.unobservable.T

@@ -1,4 +1,4 @@
-"""Checks that residuals cannot make: halves of the recording against each other, landmarks associated across cameras."""
+"""Checks that residuals cannot make: split halves of the recording, held-out landmarks."""
 
 from __future__ import annotations
 

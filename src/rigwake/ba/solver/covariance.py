@@ -29,7 +29,7 @@ _LEAST_FRACTION = (
     1e-9  # of the information left; below, rounding speaks (sigma > 3e4 times the conditional one)
 )
 _ROUNDING = 1e-12  # added to the states' scaled diagonal, so that a free gauge of theirs can be eliminated
-_TOUCHED = 1e-5  # a quantity whose (unit) direction has more than this of an undetermined one is undetermined
+_TOUCHED = 1e-5  # a quantity whose (unit) direction has more than this of an unobservable one is unobservable
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class RigCovariance:
     scale: (k,) inverse roots of the information that each has when all else is known. fractions: (k,) eigenvalues
     of the scaled information, increasing. directions: (k, k) eigenvectors as columns, in scaled parameters.
     state_covariances: (N, d, d) of the states' own components, or None if they were not asked for; held
-    components are zero, and undetermined directions of shared parameters count as held. excess: (g, g) what
+    components are zero, and unobservable directions of shared parameters count as held. excess: (g, g) what
     errors that last along tracks add, in whitened determined directions (see `clusters.py`), or None.
     """
 
@@ -66,7 +66,7 @@ class RigCovariance:
     def of(self, rows: Array) -> tuple[Array, Mask]:
         """Covariance (q, q) of the quantities `rows @ parameters`, rows (q, k), and which are determined (q,).
 
-        Rows and columns of undetermined quantities are NaN.
+        Rows and columns of unobservable quantities are NaN.
         """
         scaled = np.atleast_2d(rows) * self.scale
         good = self.observable
