@@ -21,7 +21,7 @@ from rigwake.recording import CameraStream
 from rigwake.tracking.masks import beyond_lens, mask_from_file
 
 _FEWEST_TO_WEIGH = 20
-_HELD_OUT = 7  # the landmarks of every seventh search are only used to check the result
+_HELD_OUT = 7  # one landmark in seven is only used to check the result
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +54,9 @@ def adjust_with_association(
 ) -> tuple[AdjustedRig, CrossCameraMatches]:
     """The rig adjusted with landmarks found again in other cameras and at other times.
 
-    Every round predicts with what the one before has found. In the last, some of the agreeing observations
-    are held out. Heights that nothing has told yet are held until then.
+    Every round predicts with what the one before has found. What is found of the held-out landmarks in other images
+    is never used by any round; those of the last are returned, to check the result. Heights that nothing has told
+    yet are held until then.
     """
     used, unused = 0, Observations.empty()
     free = adjusted.solution.problem
@@ -72,11 +73,8 @@ def adjust_with_association(
         progress(f"looking for landmarks in other cameras, round {done + 1}")
         searches = propose_searches(problem, images, usable, search)
         found = find_landmarks(problem, searches, streams, search)
-        if last:
-            back = found.landmark_indices % _HELD_OUT == 0
-            found, held_out = found.take(~back), found.take(back)
-        else:
-            held_out = Observations.empty()
+        is_held_out = held_out_landmarks(adjusted)[found.landmark_indices]
+        found, held_out = found.take(~is_held_out), found.take(is_held_out)
         found = _weighed(found, adjusted.solution)
         progress(f"adjusting with {len(found)} observations associated across cameras")
         with_found = AssembledProblem(
@@ -92,6 +90,12 @@ def adjust_with_association(
         used += len(found)
         unused = _renumbered(held_out, before, adjusted)
     return adjusted, CrossCameraMatches(used, unused)
+
+
+def held_out_landmarks(adjusted: AdjustedRig) -> Mask:
+    """(L,) which landmarks are held out: the same tracks in every round, whatever their numbers have become."""
+    spread = (adjusted.track_ids * 2_654_435_761 + adjusted.track_cameras * 40_503) % 2**32  # Knuth's multiplicative hash
+    return np.asarray((spread >> 16) % _HELD_OUT == 0)
 
 
 def _weighed(found: Observations, solution: RigSolution) -> Observations:
