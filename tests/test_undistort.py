@@ -8,7 +8,7 @@ from rigwake.cameras.convert import convert_camera
 from rigwake.cameras.models.lens import Lens
 from rigwake.cameras.protocol import CameraModel
 from rigwake.cameras.registry import camera_from_params
-from rigwake.cameras.undistort import Cylinder, Equirectangular, ViewGeometry, covering_views, remap_table
+from rigwake.cameras.virtual_views import Cylinder, Equirectangular, ViewGeometry, covering_views, remap_table
 from rigwake.errors import CameraError
 from rigwake.geometry import so3
 

@@ -21,6 +21,7 @@ VERBS: tuple[str, ...] = (
     "odometry",
     "handeye",
     "intrinsics",
+    "undistort",
     "evaluate",
     "diff",
     "export",

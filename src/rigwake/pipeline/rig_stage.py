@@ -141,7 +141,7 @@ def _conclude(
     return calibration.with_checks(
         residuals=statistics,
         split_half=split_half_summary(split_half(solution.problem, reference, config.adjustment)),
-        **{"hand_over": association_errors(solution, matches.unused)},
+        hand_over=association_errors(solution, matches.unused),
         scale_source=first.scale_source,
         converged=solution.report.converged,
         imu_noise_factors=imu_noise_factors(selection.imu, solution.problem.imu),

@@ -94,7 +94,9 @@ def adjust_with_association(
 
 def held_out_landmarks(adjusted: AdjustedRig) -> Mask:
     """(L,) which landmarks are held out: the same tracks in every round, whatever their numbers have become."""
-    spread = (adjusted.track_ids * 2_654_435_761 + adjusted.track_cameras * 40_503) % 2**32  # Knuth's multiplicative hash
+    spread = (
+        adjusted.track_ids * 2_654_435_761 + adjusted.track_cameras * 40_503
+    ) % 2**32  # Knuth's multiplicative hash
     return np.asarray((spread >> 16) % _HELD_OUT == 0)
 
 
