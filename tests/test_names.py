@@ -37,7 +37,8 @@ OLD_WORDS = {
 }
 # keys of files that others read stay as they are; new ones stand beside them
 KEYS_OF_FILES = re.compile(
-    r"[\"'`.](hand_over|undetermined|leader)\b|\bundetermined:|hand_over\.|hand_over=association|kind `?hand_over|\.hand_over"
+    r"[\"'`.](hand_over|undetermined|leader)\b|\bundetermined:"
+    r"|hand_over\.|hand_over=association|kind `?hand_over|\.hand_over"
 )
 
 
