@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: demo test test-fast lint bench clean
+.PHONY: demo test test-fast lint bench mutants docs release-check clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -28,6 +28,22 @@ lint: $(STAMP)
 
 bench: $(STAMP)
 	@for file in benchmarks/*.py; do echo "== $$file"; OPENBLAS_NUM_THREADS=1 $(BIN)/python $$file || exit 1; done
+
+mutants: $(STAMP)
+	$(BIN)/python tests/run_mutants.py
+
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(BIN)/mkdocs build --strict --site-dir build/site
+
+release-check: $(STAMP)
+	rm -rf build/release && mkdir -p build/release
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt build twine
+	$(BIN)/python -m build --outdir build/release .
+	$(BIN)/twine check --strict build/release/*
+	$(PYTHON) -m venv build/release/env
+	build/release/env/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt build/release/*.whl
+	cd build/release && env/bin/rigwake --version && env/bin/rigwake simulate --show > /dev/null
 
 clean:
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis demo build dist
