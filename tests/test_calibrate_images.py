@@ -103,7 +103,9 @@ def test_a_camera_with_its_cap_on_is_named_and_the_other_calibrated(tmp_path: Pa
     seen = render_recording(only_front, renderer, tmp_path / "work", workers=2, progress=lambda *_: None)
     sources = blanks(simulated, CAP_ON) | {"front": seen.cameras["front"].source}
     exit_code, output = calibrate(build_recording(simulated, sources, tmp_path), tmp_path)
-    assert exit_code == 0, output
+    assert exit_code == 4, output
+    assert "1 of 2 cameras is not calibrated: left" in output
+    assert "--allow-partial" in output
     found = load_calibration(tmp_path / "out" / "calibration.yaml")
     assert set(found.cameras) == {"front"}
     assert "left" in found.checks["failed_cameras"]

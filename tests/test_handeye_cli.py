@@ -66,7 +66,7 @@ def test_provenance_identifies_the_inputs(tmp_path, run):
     )
     assert [one["path"] for one in first] == ["rig.tum", "port.tum"]
     assert first[0] == second[0]
-    assert first[1]["sha256_of_ends"] != second[1]["sha256_of_ends"]
+    assert first[1]["sha256"] != second[1]["sha256"]
 
 
 def test_pose_topic_of_a_bag(tmp_path, run, real_recordings):

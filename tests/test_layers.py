@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parent.parent / "src" / "rigwake"
 
 # left to right; a module may import from its own layer or from any layer further left
 LAYERS = [
-    ["errors", "_types", "atomic", "fingerprint", "parallel"],
+    ["errors", "_types", "atomic", "fingerprint", "parallel", "workers", "kernel_cache"],
     ["geometry"],
     ["cameras"],
     ["trajectory", "rig"],
@@ -29,7 +29,7 @@ LAYERS = [
     ["report"],
     ["config"],
     ["pipeline"],
-    ["cli"],
+    ["cli", "__main__"],
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 

@@ -43,9 +43,9 @@ class CalibrateConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     reference: str = "auto"
     cameras: tuple[str, ...] = ()
-    start_s: float = Field(default=0.0, ge=0)
-    duration_s: float | None = Field(default=None, gt=0)
-    min_duration_s: float = Field(default=15.0, gt=0)
+    start_s: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    duration_s: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    min_duration_s: float = Field(default=15.0, gt=0, allow_inf_nan=False)
     jobs: int = Field(default=0, ge=0)
     seed: int = 0
     time_offsets: bool = True

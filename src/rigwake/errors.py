@@ -6,7 +6,9 @@
     │   └── TrajectoryError         ... a trajectory file
     ├── CameraError                 a camera model cannot do what was asked of it
     ├── EstimationError             an estimator did not reach a trustworthy answer
-    └── UnobservableError           the motion cannot determine what was asked (exit code 3)
+    ├── UnobservableError           the motion cannot determine what was asked (exit code 3)
+    ├── PartialResultError          the result was written, but a camera is missing from it (exit code 4)
+    └── HostError                   disk, memory, permissions or processes of the computer failed (exit code 1)
 
 Libraries raise these, only the command line exits. A message gives cause, consequence and remedy.
 """
@@ -54,3 +56,15 @@ class UnobservableError(RigwakeError):
     """The motion in the recording cannot determine what was asked."""
 
     exit_code = 3
+
+
+class PartialResultError(RigwakeError):
+    """A result was written, but something that the user has is missing from it."""
+
+    exit_code = 4
+
+
+class HostError(RigwakeError):
+    """The computer failed: disk, memory, permissions, open files, a process that was ended."""
+
+    exit_code = 1

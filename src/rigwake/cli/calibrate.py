@@ -6,11 +6,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-import yaml
 from rich.markup import escape
 
 from rigwake.cli.console import figures_table, next_step, out, print_title, progress_bars, write_json
-from rigwake.cli.options import JsonOption, TopicOption, TopicsOption
+from rigwake.cli.options import (
+    AllowPartialOption,
+    JsonOption,
+    TopicOption,
+    TopicsOption,
+    require_there,
+    require_writable,
+)
+from rigwake.errors import PartialResultError, UsageError
+from rigwake.pipeline.out_folder import check_out_folder
 
 if TYPE_CHECKING:
     from rigwake.calibration import Calibration
@@ -41,6 +49,8 @@ def command(
     resume: Annotated[
         bool, typer.Option("--resume", help="Keep the stages that a former run finished.")
     ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the result that the folder holds.")] = False,
+    allow_partial: AllowPartialOption = False,
     jobs: Annotated[int | None, typer.Option(help="Processes (default: one per core).")] = None,
     seed: Annotated[int | None, typer.Option(help="Random seed.")] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file of settings.")] = None,
@@ -51,7 +61,7 @@ def command(
         bool, typer.Option("--view", help="Show the result in the rerun viewer (extra `rerun`).")
     ] = False,
     print_config: Annotated[bool, typer.Option("--print-config", help="Show all settings and stop.")] = False,
-    topic: TopicOption = (),
+    topic: TopicOption = None,
     topics: TopicsOption = None,
     json_file: JsonOption = None,
 ) -> None:
@@ -61,9 +71,13 @@ def command(
 
     Example: [cyan]rigwake calibrate sail.mcap -o OUT --reference base_link --prior tape.yaml[/cyan]
     """
+    require_there(recording, config, prior, trajectories, topics)
+    if recording is not None:
+        require_writable("-o", out_folder, folder=True)
+        require_writable("--json", json_file)
+        check_out_folder(out_folder, [recording], force=force, resume=resume)
     from rigwake.calibration.yaml_file import calibration_to_dict
     from rigwake.config import load_config
-    from rigwake.errors import UsageError
     from rigwake.pipeline.calibration_run import calibrate
     from rigwake.pipeline.prior import load_prior
     from rigwake.readers.topics import TopicMap
@@ -79,19 +93,23 @@ def command(
         seed=seed,
     )
     if print_config:
+        import yaml
+
         out.print(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False), end="")
         return
     if recording is None:
         raise UsageError("No recording was given.", remedy="rigwake calibrate RECORDING -o OUT")
+    known = None if prior is None else load_prior(prior)
     with progress_bars() as bars:
         run = calibrate(
             recording,
             out_folder,
             settings,
-            topics=TopicMap.from_options(topic, topics),
+            topics=TopicMap.from_options(topic or (), topics),
             trajectories=trajectories,
-            prior=None if prior is None else load_prior(prior),
+            prior=known,
             resume=resume,
+            force=force,
             progress=bars,
         )
     if json_file is not None:
@@ -103,17 +121,34 @@ def command(
         from rigwake.report.rerun_log import log_to_rerun
 
         log_to_rerun(load_report_content(run.out), None, view)
+    if run.failed and not allow_partial:
+        raise PartialResultError(
+            f"{_headline(run)}.",
+            consequence=f"The others are in {run.out / 'calibration.yaml'}.",
+            remedy="See the reasons above. With --allow-partial, such a result counts as done (exit code 0).",
+        )
 
 
 def _print_run(run: CalibrationRun) -> None:
     """The rig, what was given up and noted, what was written, what to do next."""
+    if run.failed:
+        out.print(f"[bold red]{escape(_headline(run))}[/bold red]")
     print_calibration(run.calibration)
     for name, reason in run.failed.items():
-        out.print(f"[red]{escape(name)} is not calibrated:[/red] {escape(reason)}")
+        out.print(f"[red]{escape(name)} is not calibrated:[/red] {escape(reason.removeprefix(f'{name}: '))}")
     for note in run.notes:
         out.print(f"[dim]note: {escape(note)}[/dim]")
-    out.print(f"written: {run.out / 'calibration.yaml'}, {run.out / 'report.html'}", soft_wrap=True)
-    next_step(f"rigwake report {run.out} --open", "look at it before you believe it")
+    out.print(f"written: {escape(f'{run.out}/calibration.yaml, {run.out}/report.html')}", soft_wrap=True)
+    next_step(["rigwake", "report", run.out, "--open"], "look at it before you believe it")
+
+
+def _headline(run: CalibrationRun) -> str:
+    """Which cameras are missing from the result."""
+    count = len(run.failed)
+    total = count + len(run.calibration.cameras)
+    return (
+        f"{count} of {total} cameras {'is' if count == 1 else 'are'} not calibrated: {', '.join(run.failed)}"
+    )
 
 
 def _millimetres(value_m: float, std_m: float) -> str:

@@ -2,23 +2,91 @@
 
 from __future__ import annotations
 
+import codecs
 import json
+import shlex
+import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderableType, RenderHook, RenderResult
 from rich.markup import escape
 from rich.panel import Panel
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeRemainingColumn
+from rich.segment import Segment
 from rich.table import Table
 
 from rigwake.atomic import write_text_atomic
 from rigwake.errors import RigwakeError
 
-out = Console()
-err = Console(stderr=True)
+# what could move the cursor, colour the terminal, or turn the direction of writing: shown, not done
+_CONTROLS = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"}
+_CONTROLS |= {
+    code: f"\\u{code:04x}" for code in (0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
+}
+_PLAIN = {
+    "±": "+-",
+    "°": " deg",
+    "–": "-",
+    "—": "-",
+    "→": "->",
+    "…": "...",
+    "·": ".",
+    "│": "|",
+    "²": "^2",
+    "×": "x",
+}
+
+
+def shown(text: str) -> str:
+    """The text with control characters written out, as they may stand in names of topics and folders."""
+    return text.translate(_CONTROLS)
+
+
+class _Shown:
+    """What a renderable renders, control characters written out."""
+
+    def __init__(self, inner: RenderableType) -> None:
+        self._inner = inner
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for segment in console.render(self._inner, options):
+            yield segment if segment.control else Segment(shown(segment.text), segment.style)
+
+
+class _ShowControls(RenderHook):
+    def process_renderables(self, renderables: list[ConsoleRenderable]) -> list[ConsoleRenderable]:
+        return [_Shown(renderable) for renderable in renderables]
+
+
+def _console(stderr: bool = False) -> Console:
+    console = Console(stderr=stderr)
+    console.push_render_hook(_ShowControls())
+    return console
+
+
+out = _console()
+err = _console(stderr=True)
+
+
+def adapt_streams() -> None:
+    """Let standard output and standard error take every character, whatever their encoding: what it lacks is written
+    in ASCII."""
+    codecs.register_error("rigwake-plain", _in_ascii)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="rigwake-plain")
+
+
+def _in_ascii(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    wrong = error.object[error.start : error.end]
+    known = (_PLAIN.get(c, c) for c in wrong)
+    return "".join(known).encode("ascii", "backslashreplace").decode("ascii"), error.end
 
 
 def print_error(error: RigwakeError) -> None:
@@ -28,14 +96,21 @@ def print_error(error: RigwakeError) -> None:
         lines.append(escape(error.consequence))
     if error.remedy:
         lines.append(f"[green]→ {escape(error.remedy)}[/green]")
-    titles = {2: "wrong usage", 3: "the motion cannot determine this"}
+    titles = {
+        2: "wrong usage",
+        3: "the motion cannot determine this",
+        4: "a part is missing",
+        5: "the computer failed",
+    }
     err.print(
         Panel("\n".join(lines), title=titles.get(error.exit_code, "failed"), border_style="red", expand=False)
     )
 
 
-def next_step(command: str, why: str) -> None:
-    """Name the next step, as every command does when it ends."""
+def next_step(command: str | Sequence[object], why: str) -> None:
+    """Name the next step, as every command does when it ends. command: its words, quoted here where they need it."""
+    if not isinstance(command, str):
+        command = shlex.join(map(str, command))
     out.print(f"\n[bold]next:[/bold] [cyan]{escape(command)}[/cyan]  {escape(why)}", soft_wrap=True)
 
 
@@ -64,23 +139,65 @@ def write_json(path: Path, content: Any) -> None:
         write_text_atomic(path, text)
 
 
-def progress_bar() -> Progress:
-    """The progress bar of long work, on stderr, gone when done."""
-    return Progress(
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        TimeRemainingColumn(),
-        console=err,
-        transient=True,
-    )
+class PlainProgress:
+    """Progress as lines of text, where standard error is no terminal: a line per step and every so many seconds."""
+
+    def __init__(self) -> None:
+        self._tasks: list[dict[str, Any]] = []
+
+    def add_task(self, description: str, total: float = 1.0) -> TaskID:
+        """Another thing that is done."""
+        self._tasks.append({"what": description, "done": 0.0, "total": total, "said": ("", 0.0)})
+        return TaskID(len(self._tasks) - 1)
+
+    def advance(self, task: TaskID, steps: float = 1.0) -> None:
+        """So much more is done."""
+        self.update(task, completed=self._tasks[task]["done"] + steps)
+
+    def update(
+        self,
+        task: TaskID,
+        *,
+        description: str | None = None,
+        completed: float | None = None,
+        total: float | None = None,
+    ) -> None:
+        """What is done now, how much of it, of how much."""
+        state = self._tasks[task]
+        new = {"what": description, "done": completed, "total": total}
+        state.update({key: value for key, value in new.items() if value is not None})
+        now, (what, when) = time.monotonic(), state["said"]
+        if state["what"] == what and now - when < _SECONDS_BETWEEN_LINES:
+            return
+        state["said"] = (state["what"], now)
+        percent = min(100 * state["done"] / state["total"], 100) if state["total"] else 0
+        err.print(f"{state['what']} {percent:.0f} %", highlight=False, soft_wrap=True)
+
+
+_SECONDS_BETWEEN_LINES = 10.0
+
+
+@contextmanager
+def progress_bar() -> Iterator[Progress | PlainProgress]:
+    """The progress of long work, on stderr: a bar that is gone when done, or plain lines where that is no terminal."""
+    with _progress(TextColumn("{task.completed:.0f}/{task.total:.0f}"), TimeRemainingColumn()) as progress:
+        yield progress
+
+
+@contextmanager
+def _progress(*figures: Any) -> Iterator[Progress | PlainProgress]:
+    if not err.is_terminal:
+        yield PlainProgress()
+        return
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), *figures)
+    with Progress(*columns, console=err, transient=True) as progress:
+        yield progress
 
 
 class ProgressBars:
     """One bar per name, told by `bars(name, what, fraction)`."""
 
-    def __init__(self, progress: Progress) -> None:
+    def __init__(self, progress: Progress | PlainProgress) -> None:
         self._progress = progress
         self._tasks: dict[str, TaskID] = {}
 
@@ -93,12 +210,6 @@ class ProgressBars:
 
 @contextmanager
 def progress_bars() -> Iterator[ProgressBars]:
-    """Bars of things done at the same time, on stderr, gone when done."""
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:.0f} %"),
-    )
-    with Progress(*columns, console=err, transient=True) as progress:
+    """Progress of things done at the same time, on stderr: bars that are gone when done, or plain lines."""
+    with _progress(TextColumn("{task.percentage:.0f} %")) as progress:
         yield ProgressBars(progress)

@@ -8,11 +8,12 @@ from typing import Annotated
 import typer
 
 from rigwake.cli.console import next_step, out
+from rigwake.cli.options import require_writable
 
 
 def command(
     folder: Annotated[
-        Path, typer.Option("-o", "--out", help="Folder for the recording and the result.")
+        Path, typer.Option("-o", "--out", "--output", help="Folder for the recording and the result.")
     ] = Path("demo"),
 ) -> None:
     """Simulate a harbour recording, calibrate it, compare with the truth and write the report.
@@ -23,13 +24,17 @@ def command(
     """
     from rigwake.cli import calibrate, evaluate, report, simulate
 
+    require_writable("-o", folder, folder=True)
+
     recording, result = folder / "harbour.bag", folder / "result"
     if recording.exists():
         out.print(f"{recording} is there already: not simulated again.")
     else:
         folder.mkdir(parents=True, exist_ok=True)
         simulate.command("demo", output=recording)
-    calibrate.command(recording, result)
+    calibrate.command(recording, result, force=True)
     evaluate.command(result / "calibration.yaml", folder / "harbour_truth" / "truth.yaml")
     report.command(result)
-    next_step(f"open {result / 'report.html'}", "then calibrate your own: rigwake calibrate REC -o OUT")
+    next_step(
+        ["rigwake", "report", result, "--open"], "then calibrate your own: rigwake calibrate REC -o OUT"
+    )

@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 
 from rigwake.cli.console import figures_table, next_step, out, print_title, write_json
-from rigwake.cli.options import JsonOption
+from rigwake.cli.options import JsonOption, require_number, require_there, require_writable
 
 if TYPE_CHECKING:
     from rigwake.evaluation.rig_errors import CameraDifference
@@ -29,6 +29,10 @@ def command(
 
     Example: [cyan]rigwake diff june.yaml july.yaml --range 10 --range 100[/cyan]
     """
+    require_there(first, second)
+    for value in range_m or ():
+        require_number("--range", value, above=0.0)
+    require_writable("--json", json_file)
     from rigwake.calibration.yaml_file import plain
     from rigwake.evaluation.rig_errors import compare_calibrations
     from rigwake.exporters import in_common_frame, read_calibration
@@ -43,7 +47,7 @@ def command(
     _print(differences, ranges, f"{second.name} against {first.name}")
     for note in notes:
         out.print(f"note: {note}", style="yellow", markup=False, highlight=False)
-    next_step(f"rigwake export {second} --to ros-static-tf -o tf.launch.py", "load one into your system")
+    next_step(["rigwake", "export", second, "--to", "csv", "--allow-unobservable"], "one of them as a table")
 
 
 def _print(differences: dict[str, CameraDifference], ranges_m: Sequence[float], title: str) -> None:

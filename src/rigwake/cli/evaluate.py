@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 
 from rigwake.cli.console import figures_table, next_step, out, print_title, write_json
-from rigwake.cli.options import JsonOption, require
+from rigwake.cli.options import JsonOption, completed_from, require, require_there, require_writable
 
 if TYPE_CHECKING:
     from rigwake.evaluation.rig_errors import RigErrors
@@ -25,7 +25,8 @@ def command(
     gauge: Annotated[
         str,
         typer.Option(
-            help="`reference`: in the reference frame; `align`: after fitting the whole rig to the truth."
+            help="`reference`: in the reference frame; `align`: after fitting the whole rig to the truth.",
+            autocompletion=completed_from(("reference", "align")),
         ),
     ] = "reference",
     json_file: JsonOption = None,
@@ -34,11 +35,13 @@ def command(
 
     Example: [cyan]rigwake evaluate OUT/calibration.yaml --truth truth.yaml --json errors.json[/cyan]
     """
+    require_there(calibration, truth)
+    require("--gauge", gauge, ("reference", "align"))
+    require_writable("--json", json_file)
     from rigwake.evaluation.rig_errors import evaluate_calibration
     from rigwake.exporters import UNNAMED_FRAMES, read_calibration
     from rigwake.readers.truth_files import read_true_rig, rig_in_frame
 
-    require("--gauge", gauge, ("reference", "align"))
     found = read_calibration(calibration)
     rig = read_true_rig(truth)
     if found.reference in UNNAMED_FRAMES:
@@ -53,7 +56,12 @@ def command(
         if str(json_file) == "-":
             return
     _print(errors, f"errors of {calibration.name}, cameras in {found.reference}")
-    next_step(f"rigwake diff {calibration} OTHER.yaml", "compare with another calibration")
+    if (calibration.parent / "report.html").is_file():
+        next_step(["rigwake", "report", calibration.parent, "--open"], "look where the errors come from")
+    else:
+        next_step(
+            ["rigwake", "diff", calibration, calibration], "compare calibrations: give another as the second"
+        )
 
 
 def _print(errors: RigErrors, title: str) -> None:

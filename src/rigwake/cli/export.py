@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rigwake.cli.console import next_step, out
-from rigwake.cli.options import require
+from rigwake.cli.options import EXPORT_FORMATS, completed_from, require, require_number, require_there
 
 
 def command(
@@ -19,11 +19,14 @@ def command(
         str,
         typer.Option(
             "--to",
-            help="kalibr, openvins, basalt, camodocal, colmap, mrcal, opencv, ros-static-tf, urdf, json or csv.",
+            help=f"{', '.join(EXPORT_FORMATS[:-1])} or {EXPORT_FORMATS[-1]}.",
+            metavar="FORMAT",
+            autocompletion=completed_from(EXPORT_FORMATS),
         ),
     ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="File or folder to write; default beside the input.")
+        Path | None,
+        typer.Option("-o", "--out", "--output", help="File or folder to write; default beside the input."),
     ] = None,
     parent_frame: Annotated[str, typer.Option(help="ROS, URDF: the parent frame; default the rig's.")] = "",
     child_frame: Annotated[
@@ -50,10 +53,12 @@ def command(
 
     Example: [cyan]rigwake export OUT/calibration.yaml --to kalibr -o camchain.yaml[/cyan]
     """
+    require_there(calibration, imu)
+    require("--to", to, EXPORT_FORMATS)
+    require_number("--max-fit-error", max_fit_error, above=0.0)
     from rigwake.exporters import FORMATS, ExportOptions, export_calibration, read_calibration
     from rigwake.exporters.basalt import read_imu_noise
 
-    require("--to", to, list(FORMATS))
     target = output or calibration.parent / "exports" / FORMATS[to].usual_file
     options = ExportOptions(
         parent_frame, child_frame, None if imu is None else read_imu_noise(imu), max_fit_error
@@ -64,4 +69,23 @@ def command(
     out.print(f"{target}: {FORMATS[to].what}", markup=False, highlight=False)
     for note in notes:
         out.print(f"note: {note}", style="yellow", markup=False, highlight=False)
-    next_step(f"rigwake diff {calibration} {target}", "compare what was written with where it came from")
+    if _can_be_compared(calibration, target):
+        next_step(
+            ["rigwake", "diff", calibration, target], "compare what was written with where it came from"
+        )
+    else:
+        as_json = ["rigwake", "export", calibration, "--to", "json", "--allow-unobservable"]
+        next_step(as_json, "the same for programs of your own")
+
+
+def _can_be_compared(calibration: Path, target: Path) -> bool:
+    """Whether `rigwake diff` reads what was written: not every format says enough to be read back."""
+    from rigwake.errors import RigwakeError
+    from rigwake.evaluation.rig_errors import compare_calibrations
+    from rigwake.exporters import in_common_frame, read_calibration
+
+    try:
+        a, b, _ = in_common_frame(read_calibration(calibration), read_calibration(target))
+        return bool(compare_calibrations(a, b, [20.0]))
+    except RigwakeError:
+        return False

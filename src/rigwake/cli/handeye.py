@@ -10,29 +10,37 @@ import typer
 from rich.markup import escape
 
 from rigwake.cli.console import err, figures_table, next_step, out, print_title, write_json
-from rigwake.cli.options import JsonOption, require
+from rigwake.cli.options import JsonOption, completed_from, require, require_there, require_writable
 
 if TYPE_CHECKING:
     from rigwake.calibration import CalibratedCamera
     from rigwake.handeye.handeye_result import HandeyeResult
     from rigwake.trajectory import Trajectory
 
+_METHODS = ("ml", "thesis", "seed")
+_NOISES = ("auto", "estimated", "increments", "poses")
+
 
 def command(
     reference: Annotated[str, typer.Argument(help="Trajectory of the reference, metric.")],
     others: Annotated[list[str], typer.Argument(help="Trajectories of the others, one file each.")],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Write calibration.yaml here.")
+        Path | None, typer.Option("-o", "--out", "--output", help="Write calibration.yaml here.")
     ] = None,
     json_file: JsonOption = None,
     method: Annotated[
-        str, typer.Option(help="`ml`: maximum likelihood; `seed`: the linear baseline.")
+        str,
+        typer.Option(
+            help="`ml`: maximum likelihood; `seed`: the linear baseline.",
+            autocompletion=completed_from(_METHODS),
+        ),
     ] = "ml",
     noise: Annotated[
         str,
         typer.Option(
             help="Errors independent in the `increments` (odometry), in the `poses` (GNSS/INS, boards), or "
-            "`estimated`; `auto`: as covariances beside the files say, else estimated."
+            "`estimated`; `auto`: as covariances beside the files say, else estimated.",
+            autocompletion=completed_from(_NOISES),
         ),
     ] = "auto",
     time_offset: Annotated[
@@ -47,13 +55,16 @@ def command(
     Formats: TUM, KITTI, EuRoC, csv with header; pose topics of ROS bags as [cyan]recording.bag:/topic[/cyan].
     Example: [cyan]rigwake handeye imu.tum port.tum starboard.tum -o calibration.yaml[/cyan]
     """
+    require("--method", method, _METHODS)
+    require("--noise", noise, _NOISES)
+    require_writable("-o", output)
+    require_writable("--json", json_file)
+    inputs = [_Input.parse(text) for text in (reference, *others)]
+    require_there(*(one.path for one in inputs))
     from rigwake.calibration import save_calibration
     from rigwake.handeye.handeye_result import HandeyeOptions
     from rigwake.handeye.joint_calibration import calibrate_handeye
 
-    require("--method", method, ("ml", "thesis", "seed"))
-    require("--noise", noise, ("auto", "estimated", "increments", "poses"))
-    inputs = [_Input.parse(text) for text in (reference, *others)]
     trajectories = [_read(one) for one in inputs]
     options = HandeyeOptions(
         method="thesis" if method in ("thesis", "seed") else "ml",
@@ -76,10 +87,20 @@ def command(
             return
     _print(result)
     if output is not None:
-        next_step(f"rigwake export {output} --to kalibr -o camchain.yaml", "load it into other tools")
+        next_step(
+            ["rigwake", "export", output, "--to", "csv"], "a table; mountings without a lens fit json and csv"
+        )
     else:
-        files = " ".join((reference, *others))
-        next_step(f"rigwake handeye {files} -o calibration.yaml", "keep the result")
+        options_given = _words_of_options(method, noise, time_offset, scale)
+        words = ["rigwake", "handeye", reference, *others, *options_given, "-o", "calibration.yaml"]
+        next_step(words, "keep the result")
+
+
+def _words_of_options(method: str, noise: str, time_offset: bool, scale: bool) -> list[str]:
+    """The same options again, where they are not those by default."""
+    words = [] if method == "ml" else ["--method", method]
+    words += [] if noise == "auto" else ["--noise", noise]
+    return words + ([] if time_offset else ["--no-time-offset"]) + (["--scale"] if scale else [])
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -11,14 +11,19 @@ from rich.table import Table
 
 from rigwake.atomic import write_text_atomic
 from rigwake.cli.console import figures_table, next_step, out, progress_bar, write_json
-from rigwake.cli.options import JsonOption, TopicOption, TopicsOption
-from rigwake.inspection.inspection_page import inspection_page
-from rigwake.inspection.inspection_summary import inspection_to_dict
-from rigwake.inspection.readiness import Readiness, judge
-from rigwake.inspection.recording_inspection import Inspection, inspect_recording
-from rigwake.inspection.time_offsets import SensorTimeOffset
-from rigwake.readers.open import open_recording
-from rigwake.readers.topics import TopicMap
+from rigwake.cli.options import (
+    JsonOption,
+    TopicOption,
+    TopicsOption,
+    require_there,
+    require_writable,
+    topic_words,
+)
+
+if TYPE_CHECKING:
+    from rigwake.inspection.readiness import Readiness
+    from rigwake.inspection.recording_inspection import Inspection
+    from rigwake.inspection.time_offsets import SensorTimeOffset
 
 _COLOURS = {"enough": "green", "partly": "yellow", "not enough": "red"}
 _SEVERITIES = {"note": "dim", "warning": "yellow", "error": "red"}
@@ -29,7 +34,7 @@ def command(
     recording: Annotated[
         Path, typer.Argument(help="ROS bag, MCAP, EuRoC or KITTI folder, folder of images, NMEA log.")
     ],
-    topic: TopicOption = (),
+    topic: TopicOption = None,
     topics: TopicsOption = None,
     json_file: JsonOption = None,
     html: Annotated[Path | None, typer.Option(help="Write one HTML page with plots.")] = None,
@@ -40,11 +45,22 @@ def command(
 
     Example: [cyan]rigwake inspect images/ --topic imu=imu.csv --html inspection.html[/cyan]
     """
-    opened = open_recording(recording, TopicMap.from_options(topic, topics))
+    require_there(recording, topics)
+    require_writable("--json", json_file)
+    require_writable("--html", html)
+    from rigwake.inspection.inspection_page import inspection_page
+    from rigwake.inspection.inspection_summary import inspection_to_dict
+    from rigwake.inspection.readiness import judge
+    from rigwake.inspection.recording_inspection import inspect_recording
+    from rigwake.readers.open import open_recording
+    from rigwake.readers.topics import TopicMap
+
+    opened = open_recording(recording, TopicMap.from_options(topic or (), topics))
     with progress_bar() as bar:
         task = bar.add_task("reading", total=1)
         inspection = inspect_recording(
-            opened, lambda text, done, total: bar.update(task, description=text, completed=done, total=total)
+            opened,
+            lambda text, done, total: bar.update(task, description=escape(text), completed=done, total=total),
         )
     verdict = judge(inspection)
     if json_file is not None:
@@ -53,15 +69,19 @@ def command(
         write_text_atomic(html, inspection_page(inspection, verdict))
     if str(json_file) != "-":
         _print(inspection, verdict)
-        if verdict.word == "not enough":
-            next_step("rigwake inspect NEW_RECORDING", "after recording again as advised")
+        given = topic_words(topic, topics)
+        if verdict.word != "not enough":
+            next_step(["rigwake", "calibrate", recording, *given, "-o", "OUT"], "estimate the rig")
+        elif any(check.name == "intrinsics" and check.passed is False for check in verdict.checks):
+            next_step(["rigwake", "intrinsics", "--help"], "how to find the intrinsics of a lens")
         else:
-            next_step(f"rigwake calibrate {recording} -o OUT", "estimate the rig")
+            page = ["--html", "inspection.html"]
+            next_step(["rigwake", "inspect", recording, *given, *page], "see why, then record as advised")
 
 
 def _print(inspection: Inspection, verdict: Readiness) -> None:
     recording = inspection.recording
-    out.print(f"[bold]{escape(recording.path.name)}[/bold]  {recording.kind}")
+    out.print(f"[bold]{escape(recording.path.name)}[/bold]  {escape(recording.kind)}")
     out.print(_sensor_table(inspection))
     for key in inspection.timings:
         if what := _what(inspection, key):

@@ -5,12 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from rigwake.cli.console import figures_table, next_step, out, print_title, progress_bar, write_json
-from rigwake.cli.options import JsonOption
+from rigwake.cli.options import (
+    LENS_MODELS,
+    JsonOption,
+    completed_from,
+    require,
+    require_number,
+    require_there,
+    require_writable,
+)
 from rigwake.errors import UsageError
 
 if TYPE_CHECKING:
@@ -32,10 +40,13 @@ def command(
     model: Annotated[
         str,
         typer.Option(
-            help="pinhole, rational, kb4, kb23, mei, scaramuzza, eucm, ds, fov; `auto` compares them."
+            help=f"{', '.join(LENS_MODELS)}; `auto` compares them.",
+            autocompletion=completed_from((*LENS_MODELS, "auto")),
         ),
     ] = "auto",
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Write the camera file here.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--out", "--output", help="Write the camera file here.")
+    ] = None,
     name: Annotated[str | None, typer.Option(help="The camera's name in the file.")] = None,
     image_size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT, needed with a csv file.")] = None,
     fov: Annotated[
@@ -50,6 +61,14 @@ def command(
 
     Example: [cyan]rigwake intrinsics images/ --board aprilgrid:6x6:0.088:0.3 --model kb4 -o front.yaml[/cyan]
     """
+    require_there(*images)
+    require("--model", model, (*LENS_MODELS, "auto"))
+    require_number("--fov", fov, above=0.0, below=360.0)
+    require_writable("-o", output)
+    require_writable("--plots", plots, folder=True)
+    require_writable("--json", json_file)
+    import numpy as np
+
     from rigwake.intrinsics.board_calibration import calibrate
     from rigwake.intrinsics.plots import save_plots
     from rigwake.intrinsics.result_file import calibration_to_dict, save_intrinsics
@@ -75,11 +94,21 @@ def command(
             return
     _print(result, observations, scores)
     for path in [*([output] if output else []), *written]:
-        out.print(f"written: {path}")
+        out.print(f"written: {escape(str(path))}", soft_wrap=True)
     if output is None:
-        next_step("rigwake intrinsics ... -o FILE.yaml", "write the camera to a file")
+        words = _words_again(images, board, image_size, fov, fix, free)
+        next_step([*words, "--model", result.camera.model, "-o", f"{camera_name}.yaml"], "write it to a file")
     else:
-        next_step(f"rigwake calibrate REC --cameras {output} -o OUT", "calibrate the rig with this camera")
+        next_step(["rigwake", "calibrate", "--help"], f"then give the recording {escape(str(output))}")
+
+
+def _words_again(
+    images: list[Path], board: str | None, image_size: str | None, fov: float | None, fix: str, free: str
+) -> list[object]:
+    """The same command again, but for its model and its outputs."""
+    options = {"--board": board, "--image-size": image_size, "--fov": fov, "--fix": fix, "--free": free}
+    given = [word for option, value in options.items() if value for word in (option, value)]
+    return ["rigwake", "intrinsics", *images, *given]
 
 
 def _names(text: str) -> list[str]:
@@ -109,6 +138,8 @@ def _size(text: str | None) -> tuple[int, int]:
         raise UsageError("A csv file of corners needs the image size.", remedy="Add --image-size 752x480.")
     try:
         width_px, height_px = (int(word) for word in text.lower().split("x"))
+        if min(width_px, height_px) < 1:
+            raise ValueError
     except ValueError:
         raise UsageError(f"--image-size {text!r} is not WIDTHxHEIGHT.", remedy="Write 752x480.") from None
     return width_px, height_px
@@ -123,6 +154,8 @@ def _compare(observations: BoardObservations) -> list[ModelScore]:
 
 
 def _print(result: IntrinsicCalibration, observations: BoardObservations, scores: list[ModelScore]) -> None:
+    import numpy as np
+
     if scores:
         table = Table(box=None, pad_edge=False)
         for heading in ("model", "RMS px", "± px", "free", ""):

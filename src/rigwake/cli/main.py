@@ -1,18 +1,24 @@
 """`rigwake VERB ...`: one module per verb beside this one; only here does an error become an exit code.
 
-Exit codes: 0 done, 1 failed, 2 wrong usage, 3 the motion cannot determine what was asked.
+Exit codes: 0 done, 1 failed, 2 wrong usage, 3 the motion cannot determine what was asked, 4 a result without all
+cameras, 5 a camera has moved (`monitor`); 130 and 143 after Ctrl-C and SIGTERM.
+
+Verbs import what computes only when they run, so that --help and the completion of the shell are quick.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import sys
+from collections.abc import Sequence
 
 import typer
 
 from rigwake import __version__
-from rigwake.cli.console import print_error
-from rigwake.errors import RigwakeError
+from rigwake.cli.console import adapt_streams, err, print_error
+from rigwake.cli.faults import Stopped, signals_raise, silence_output, words_of
+from rigwake.kernel_cache import provide_kernel_cache
 
 # one module per verb in this package, each with a function `command`; the order is that of --help
 VERBS: tuple[str, ...] = (
@@ -30,6 +36,11 @@ VERBS: tuple[str, ...] = (
     "demo",
 )
 
+EXIT_CODES = (
+    "Exit codes: 0 done; 1 failed; 2 wrong usage; 3 the motion cannot determine it; 4 done, but a camera is missing "
+    "from the result; 5 a camera has moved (monitor)."
+)
+
 
 def _print_version(wanted: bool) -> None:
     if wanted:
@@ -45,24 +56,71 @@ def _root(
     """Calibrate a camera rig from the wake it leaves."""
 
 
-def build_app() -> typer.Typer:
-    """The command-line application with every verb."""
+def build_app(verbs: Sequence[str] = VERBS) -> typer.Typer:
+    """The command-line application with these verbs."""
     app = typer.Typer(
-        name="rigwake", no_args_is_help=True, rich_markup_mode="rich", pretty_exceptions_enable=False
+        name="rigwake",
+        no_args_is_help=True,
+        rich_markup_mode="rich",
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["--help", "-h"]},
+        epilog=EXIT_CODES,
     )
     app.callback()(_root)
-    for verb in VERBS:
+    for verb in verbs:
         module = importlib.import_module(f"rigwake.cli.{verb}")
-        app.command(verb)(module.command)
+        app.command(verb, epilog=EXIT_CODES)(module.command)
     return app
 
 
-def main() -> None:
-    """Entry point of the `rigwake` program."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the `rigwake` program; ends with SystemExit. arguments: by default those of the process."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    adapt_streams()
+    with signals_raise():
+        sys.exit(_exit_code(words))
+
+
+def _exit_code(words: list[str]) -> int:
+    """Run the command; whatever goes wrong is printed and becomes a code."""
     try:
-        build_app()()
-    except RigwakeError as error:
+        code = _run(words)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        return code
+    except Stopped as stopped:
+        error, code = stopped.words(words), stopped.exit_code
+    except BrokenPipeError:  # as with `| head`
+        silence_output()
+        return 1
+    except Exception as fault:
+        error = words_of(fault)
+        code = error.exit_code
+        if isinstance(fault, OSError):
+            silence_output()
+    with contextlib.suppress(OSError):
         print_error(error)
-        sys.exit(error.exit_code)
-    except BrokenPipeError:
-        sys.exit(1)
+    return code
+
+
+def _run(words: list[str]) -> int:
+    try:
+        _say_where_kernels_are(words)
+        only = words[:1] if words and words[0] in VERBS else VERBS  # the others need not be imported
+        build_app(only)(words, prog_name="rigwake")
+    except SystemExit as ended:
+        return ended.code if isinstance(ended.code, int) else int(bool(ended.code))
+    return 0
+
+
+def _say_where_kernels_are(words: list[str]) -> None:
+    """Say once that compiled loops are kept among the temporary files."""
+    folder = provide_kernel_cache()
+    if folder is not None and words[:1] and words[0] in VERBS and not any(folder.iterdir()):
+        err.print(
+            f"note: neither the installation nor a home folder can be written; compiled loops are kept in {folder} "
+            "(choose another place with NUMBA_CACHE_DIR)",
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
+        )

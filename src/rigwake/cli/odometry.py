@@ -2,33 +2,56 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
-from queue import Empty
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 
 import typer
 from rich.markup import escape
 
 from rigwake.cli.console import figures_table, next_step, out, progress_bar, write_json
-from rigwake.cli.options import JsonOption, TopicOption, TopicsOption, require
-from rigwake.errors import RigwakeError
+from rigwake.cli.options import (
+    AllowPartialOption,
+    JsonOption,
+    TopicOption,
+    TopicsOption,
+    completed_from,
+    require,
+    require_there,
+    require_writable,
+    topic_words,
+)
+from rigwake.errors import HostError, InputError, PartialResultError, RigwakeError
+from rigwake.pipeline.out_folder import check_out_folder
+from rigwake.workers import run_in_processes
 
 if TYPE_CHECKING:
     from rigwake.odometry.camera_odometry import CameraOdometry, CameraOdometryOptions
     from rigwake.recording import AttitudeStream, CameraStream, GnssStream, ImuStream, Recording
+
+_METHODS = ("adjusted", "seed")
+_FRONT_ENDS = ("klt", "sift", "fast-brief", "orb")
 
 
 def command(
     recording: Annotated[
         Path, typer.Argument(help="ROS bag, MCAP, EuRoC or KITTI folder, folder of images.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for NAME.tum, tracks and masks.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--out", "--output", help="Folder for NAME.tum, tracks and masks.")
+    ],
     camera: Annotated[str, typer.Option(help="Name of a camera, or all.")] = "all",
-    front_end: Annotated[str, typer.Option(help="klt, sift, fast-brief or orb.")] = "klt",
-    method: Annotated[str, typer.Option(help="adjusted, or the frame-to-frame baseline: seed.")] = "adjusted",
+    front_end: Annotated[
+        str,
+        typer.Option(help="klt, sift, fast-brief or orb.", autocompletion=completed_from(_FRONT_ENDS)),
+    ] = "klt",
+    method: Annotated[
+        str,
+        typer.Option(
+            help="adjusted, or the frame-to-frame baseline: seed.",
+            autocompletion=completed_from(_METHODS),
+        ),
+    ] = "adjusted",
     imu: Annotated[bool, typer.Option("--imu/--no-imu", help="Use the recording's IMU.")] = True,
     gnss: Annotated[bool, typer.Option("--gnss/--no-gnss", help="Use the recording's GNSS.")] = True,
     attitude: Annotated[
@@ -54,8 +77,10 @@ def command(
         ),
     ] = True,
     mask: Annotated[Path | None, typer.Option(help="Picture, white where the camera may be used.")] = None,
-    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
-    topic: TopicOption = (),
+    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    jobs: Annotated[int, typer.Option(help="Processes (default: one per core).", min=0)] = 0,
+    allow_partial: AllowPartialOption = False,
+    topic: TopicOption = None,
     topics: TopicsOption = None,
     json_file: JsonOption = None,
 ) -> None:
@@ -63,16 +88,22 @@ def command(
 
     Example: [cyan]rigwake odometry harbour.bag --camera front -o OUT[/cyan]
     """
+    require_there(recording, topics, mask)
+    require_writable("-o", output, folder=True)
+    require_writable("--json", json_file)
+    require("--front-end", front_end, _FRONT_ENDS)
+    require("--method", method, _METHODS)
+    check_out_folder(output, [recording], force=True, resume=False)
+    from rigwake.fingerprint import unchanged
     from rigwake.odometry.camera_odometry import CameraOdometryOptions, Method
     from rigwake.odometry.odometry_options import OdometryOptions
     from rigwake.odometry.thesis_odometry import ThesisOptions
+    from rigwake.pipeline.out_folder import check_camera_names, used_by_one
     from rigwake.readers.open import open_recording
     from rigwake.readers.topics import TopicMap
     from rigwake.tracking.tracking_options import FrontEndName, TrackingOptions
 
-    require("--front-end", front_end, get_args(FrontEndName))
-    require("--method", method, get_args(Method))
-    opened = open_recording(recording, TopicMap.from_options(topic, topics))
+    opened = open_recording(recording, TopicMap.from_options(topic or (), topics))
     options = CameraOdometryOptions(
         method=cast(Method, method),
         tracking=TrackingOptions(front_end=cast(FrontEndName, front_end)),
@@ -85,20 +116,38 @@ def command(
         refine_lens=refine_lens,
     )
     streams = list(opened.cameras.values()) if camera == "all" else [opened.camera(camera)]
+    if not streams:
+        raise InputError(
+            f"{recording.name} has no cameras.",
+            remedy="`rigwake inspect` lists what it holds; name image topics with --topic camera.front=/a/b.",
+        )
+    check_camera_names(stream.name for stream in streams)
     sensors = Sensors(
         _first(opened.imus) if imu else None,
         _first(opened.gnss) if gnss else None,
         _first(opened.attitudes) if attitude else None,
     )
-    results = _run_all(streams, sensors, options)
-    if json_file is not None:
-        write_json(json_file, _summary(opened, results))
-    _keep(results, output, quiet=str(json_file) == "-")
+    with used_by_one(output), unchanged(recording) as check_unchanged:
+        results = _run_all(streams, sensors, options, jobs)
+        check_unchanged()
+        if json_file is not None:
+            write_json(json_file, _summary(opened, results))
+        _keep(results, output, quiet=str(json_file) == "-")
+    done = {name: result for name, result in results.items() if not isinstance(result, RigwakeError)}
+    if str(json_file) != "-":
+        _name_next_step(recording, done, output, topic_words(topic, topics))
+    missing = [name for name in results if name not in done]
+    if missing and not allow_partial:
+        raise PartialResultError(
+            f"{len(missing)} of {len(results)} cameras {'has' if len(missing) == 1 else 'have'} no trajectory: "
+            f"{', '.join(missing)}.",
+            consequence=f"The others are in {output}.",
+            remedy="See the reasons above. With --allow-partial, such a result counts as done (exit code 0).",
+        )
 
 
 def _keep(results: dict[str, CameraOdometry | RigwakeError], output: Path, quiet: bool) -> None:
     """Write and print what succeeded; raises the first failure if nothing did."""
-    output.mkdir(parents=True, exist_ok=True)
     done = {n: r for n, r in results.items() if not isinstance(r, RigwakeError)}
     for name, result in done.items():
         _write(output, name, result)
@@ -107,16 +156,22 @@ def _keep(results: dict[str, CameraOdometry | RigwakeError], output: Path, quiet
     for failure in results.values():
         if not done and isinstance(failure, RigwakeError):
             raise failure
-    if not quiet:
-        files = " ".join(str(output / f"{name}.tum") for name in done)
-        next_step(f"rigwake handeye {files}", "a rig from these trajectories")
+
+
+def _name_next_step(
+    recording: Path, done: dict[str, CameraOdometry], output: Path, topics: list[str]
+) -> None:
+    """Hand-eye calibration of the trajectories, a metric one first; the whole job where that cannot be."""
+    names = sorted(done, key=lambda name: not done[name].trajectory.is_metric)
+    if len(names) > 1 and done[names[0]].trajectory.is_metric:
+        files = [output / f"{name}.tum" for name in names]
+        next_step(["rigwake", "handeye", *files], "a rig from these trajectories")
+    else:
+        next_step(["rigwake", "calibrate", recording, *topics, "-o", "OUT"], "the rig of this recording")
 
 
 def _first(streams: Any) -> Any:
     return next(iter(streams.values()), None)
-
-
-Report = Callable[[str, int, int], None]
 
 
 class Sensors(NamedTuple):
@@ -131,37 +186,34 @@ def _run_all(
     streams: list[CameraStream],
     sensors: Sensors,
     options: CameraOdometryOptions,
+    processes: int,
 ) -> dict[str, CameraOdometry | RigwakeError]:
-    """Every camera in a process of its own, as many at a time as there are processors."""
-    workers = min(len(streams), multiprocessing.cpu_count())
+    """Every camera in a process of its own, so many at a time (0: as many as there are processors)."""
     with progress_bar() as bar:
-        tasks = {stream.name: bar.add_task(stream.name, total=1) for stream in streams}
+        tasks = {stream.name: bar.add_task(escape(stream.name), total=1) for stream in streams}
 
         def show(name: str, stage: str, done: int, total: int) -> None:
-            bar.update(tasks[name], description=f"{name}: {stage}", completed=done, total=total)
+            bar.update(tasks[name], description=escape(f"{name}: {stage}"), completed=done, total=total)
 
-        if len(streams) == 1:
-            only = streams[0]
-            return {only.name: _attempt(only, sensors, options, lambda *state: show(only.name, *state))}
-        context = multiprocessing.get_context("spawn")
-        with context.Manager() as manager, ProcessPoolExecutor(workers, mp_context=context) as pool:
-            queue = manager.Queue()
-            futures = {s.name: pool.submit(_in_process, s, sensors, options, queue) for s in streams}
-            while any(not future.done() for future in futures.values()):
-                _drain(queue, show)
-            return {name: _outcome(future) for name, future in futures.items()}
+        jobs = {stream.name: _Job(stream, sensors, options) for stream in streams}
+        found = run_in_processes(_in_process, jobs, processes, show)
+        return {name: _outcome(*result) for name, result in found.items()}
 
 
-def _drain(queue: Any, show: Callable[[str, str, int, int], None]) -> None:
-    try:
-        show(*queue.get(timeout=0.2))
-    except Empty:
-        return
+class _Job(NamedTuple):
+    """What the process of a camera needs."""
+
+    stream: CameraStream
+    sensors: Sensors
+    options: CameraOdometryOptions
 
 
-def _outcome(future: Future[tuple[CameraOdometry | None, tuple[str, str, str, int] | None]]) -> Any:
-    result, failure = future.result()
+_Failure = tuple[str, str, str, int]
+
+
+def _outcome(result: CameraOdometry | None, failure: _Failure | None) -> CameraOdometry | RigwakeError:
     if failure is None:
+        assert result is not None
         return result
     cause, consequence, remedy, exit_code = failure
     error = RigwakeError(cause, consequence=consequence, remedy=remedy)
@@ -169,28 +221,25 @@ def _outcome(future: Future[tuple[CameraOdometry | None, tuple[str, str, str, in
     return error
 
 
-def _in_process(
-    stream: CameraStream, sensors: Sensors, options: CameraOdometryOptions, queue: Any
-) -> tuple[CameraOdometry | None, tuple[str, str, str, int] | None]:
+def _in_process(job: _Job, progress: Callable[..., None]) -> tuple[CameraOdometry | None, _Failure | None]:
     """One camera; an error travels between processes as its words, since exceptions pickle only their message."""
     import cv2
 
-    cv2.setNumThreads(1)  # the processes share the processors already
-    result = _attempt(stream, sensors, options, lambda *state: queue.put((stream.name, *state)))
-    if isinstance(result, RigwakeError):
-        return None, (result.cause, result.consequence, result.remedy, result.exit_code)
-    return result, None
-
-
-def _attempt(
-    stream: CameraStream, sensors: Sensors, options: CameraOdometryOptions, report: Report
-) -> CameraOdometry | RigwakeError:
     from rigwake.odometry.camera_odometry import run_camera
 
+    cv2.setNumThreads(1)  # the processes share the processors already
+    stream, sensors, options = job
+
+    def report(stage: str, done: int, total: int) -> None:
+        progress(stream.name, stage, done, total)
+
     try:
-        return run_camera(stream, sensors.imu, sensors.gnss, options, report, sensors.attitude)
+        found = run_camera(stream, sensors.imu, sensors.gnss, options, report, sensors.attitude)
+    except HostError:
+        raise
     except RigwakeError as error:
-        return error
+        return None, (error.cause, error.consequence, error.remedy, error.exit_code)
+    return found, None
 
 
 def _write(output: Path, name: str, result: CameraOdometry) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import webbrowser
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from rigwake.cli.console import next_step, out
-from rigwake.cli.options import require
+from rigwake.cli.options import completed_from, require, require_there, require_writable
 
 
 def command(
@@ -18,7 +17,9 @@ def command(
     figures: Annotated[
         Path | None, typer.Option(help="Also write figures for papers to this folder.")
     ] = None,
-    figure_format: Annotated[str, typer.Option(help="png or svg.")] = "png",
+    figure_format: Annotated[
+        str, typer.Option(help="png or svg.", autocompletion=completed_from(("png", "svg")))
+    ] = "png",
     rrd: Annotated[
         Path | None, typer.Option(help="Also write a recording for the rerun viewer (extra `rerun`).")
     ] = None,
@@ -30,9 +31,12 @@ def command(
 
     Example: [cyan]rigwake report OUT --open[/cyan]
     """
+    require_there(folder)
+    require("--figure-format", figure_format, ("png", "svg"))
+    require_writable("--figures", figures, folder=True)
+    require_writable("--rrd", rrd)
     from rigwake.report import build_report, load_report_content, summary_lines
 
-    require("--figure-format", figure_format, ("png", "svg"))
     content = load_report_content(folder)
     path = build_report(content)
     for line in summary_lines(content.calibration):
@@ -48,5 +52,13 @@ def command(
 
         log_to_rerun(content, rrd, view)
     if open_page:
+        import webbrowser
+
         webbrowser.open(path.resolve().as_uri())
-    next_step(f"rigwake export {folder / 'calibration.yaml'} --to ros-static-tf", "load it into your system")
+    words: list[object] = ["rigwake", "export", folder / "calibration.yaml", "--to", "ros-static-tf"]
+    observable = [camera.is_observable for camera in content.calibration.cameras.values()]
+    if not any(observable):
+        words[-1:] = ["json"]
+    elif not all(observable):
+        words.append("--allow-unobservable")
+    next_step(words, "load it into your system")

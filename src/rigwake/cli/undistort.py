@@ -8,13 +8,13 @@ from typing import Annotated, cast, get_args
 import typer
 
 from rigwake.cli.console import next_step, out, progress_bar
-from rigwake.cli.options import require
+from rigwake.cli.options import require, require_there, require_writable
 from rigwake.errors import UsageError
 
 
 def command(
     source: Annotated[list[Path], typer.Argument(help="Images, folders of images, or one recording.")],
-    output: Annotated[Path, typer.Option("-o", "--out", help="Folder for the pictures.")],
+    output: Annotated[Path, typer.Option("-o", "--out", "--output", help="Folder for the pictures.")],
     camera_file: Annotated[
         Path | None,
         typer.Option("--camera-file", help="The lens: any camera file. Default: the recording's."),
@@ -40,6 +40,8 @@ def command(
     from rigwake.readers.open import open_recording
 
     require("--to", to, get_args(Target))
+    require_there(*source, camera_file)
+    require_writable("--out", output, folder=True)
     target = cast(Target, to)
     given = None if camera_file is None else read_camera(camera_file, camera)
     with progress_bar() as bar:
@@ -71,7 +73,7 @@ def command(
                 stream, prepare_undistortion(model, target, focal), output, every, show
             )
     out.print(f"{len(written)} files in {output}", markup=False, highlight=False)
-    next_step(f"ls {output}", "the pictures, and cameras.yaml where the views are pinholes")
+    next_step("rigwake undistort --help", "other views: --to cylinder, --to equirectangular, --focal")
 
 
 def _only_images(source: list[Path]) -> bool:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 from rigwake.inspection.recording_inspection import Inspection
+from rigwake.recording import GnssStream, ImuStream
 
 Word = Literal["enough", "partly", "not enough"]
 
@@ -18,7 +20,8 @@ GOOD_TILT_STD_DEG = 1.0
 MIN_PATH_M = 5.0
 MAX_STILL = 0.7
 MIN_CAMERA_HZ = 3.0
-MIN_SECONDS = 10.0
+MIN_SECONDS = 15.0  # as `calibrate` demands
+_MOST_OF_IT = 0.8  # of a camera whose sail is short
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,7 @@ def _sensor_checks(inspection: Inspection) -> list[Check]:
             f"too slow or short: {', '.join(slow)}" if slow else "every camera long and fast enough",
             f"Record for at least {MIN_SECONDS:.0f} s (a minute or two is best), at {MIN_CAMERA_HZ:.0f} Hz or more.",
         ),
+        _common_time(inspection),
         Check(
             "pictures",
             not broken,
@@ -116,6 +120,37 @@ def _sensor_checks(inspection: Inspection) -> list[Check]:
             "Record GNSS or an IMU: without, all offsets are known up to one common scale.",
         ),
     ]
+
+
+def _common_time(inspection: Inspection) -> Check:
+    """Whether every camera shares enough time with the IMU and the GNSS, or without these with the other cameras."""
+    recording = inspection.recording
+    others = [_longest("imu", recording.imus), _longest("gnss", recording.gnss)]
+    anchors = [key for key in others if key is not None] or [
+        f"camera.{name}" for name in list(recording.cameras)[:1]
+    ]
+    apart = []
+    for name in recording.cameras:
+        for anchor in anchors:
+            camera, other = inspection.timings[f"camera.{name}"], inspection.timings[anchor]
+            shared_ns = min(camera.end_ns, other.end_ns) - max(camera.start_ns, other.start_ns)
+            if shared_ns * 1e-9 < min(MIN_SECONDS, _MOST_OF_IT * camera.duration_s):
+                apart.append(f"{name} and {anchor.partition('.')[2]}: {max(shared_ns * 1e-9, 0):.1f} s")
+    return Check(
+        "common time",
+        not apart,
+        True,
+        f"hardly any in common: {', '.join(apart)}" if apart else "the sensors overlap in time",
+        "Let all sensors record at the same time and on one clock: a video without stamps counts from 0, others from "
+        "1970; give its stamps in NAME_timestamps.csv.",
+    )
+
+
+def _longest(kind: str, streams: Mapping[str, ImuStream] | Mapping[str, GnssStream]) -> str | None:
+    """Key of the stream with the most samples: the one that is used."""
+    if not streams:
+        return None
+    return f"{kind}.{max(streams, key=lambda name: len(streams[name].timestamps_ns))}"
 
 
 def _motion_checks(inspection: Inspection) -> list[Check]:

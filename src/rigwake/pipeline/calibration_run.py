@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,24 +14,34 @@ from rigwake.ba.rig.initialisation import InitialRig
 from rigwake.calibration import Calibration, save_calibration
 from rigwake.config import CalibrateConfig
 from rigwake.errors import InputError, UnobservableError
-from rigwake.fingerprint import input_fingerprint
+from rigwake.fingerprint import files_changed_at, input_fingerprint, unchanged
+from rigwake.pipeline.before_start import (
+    check_line_delays,
+    check_prior,
+    check_reference,
+    read_external_trajectories,
+    without_cameras,
+)
+from rigwake.pipeline.camera_key import camera_key
 from rigwake.pipeline.camera_processes import Progress, process_cameras
 from rigwake.pipeline.camera_stage import (
     CameraJob,
     CameraOutcome,
     load_outcome,
     odometry_file,
-    outcome_file,
+    stage_files,
     tracks_file,
 )
+from rigwake.pipeline.out_folder import check_camera_names, check_out_folder, clear_results, used_by_one
 from rigwake.pipeline.outputs import write_outputs
 from rigwake.pipeline.prior import RigPrior
-from rigwake.pipeline.rig_stage import estimate_rig, initialise_rig
-from rigwake.pipeline.stage_files import StageLedger, stage_key
+from rigwake.pipeline.rig_stage import RigEstimate, estimate_rig, initialise_rig
+from rigwake.pipeline.stage_files import StageLedger
 from rigwake.pipeline.stream_selection import Selection, select
 from rigwake.readers.open import open_recording
 from rigwake.readers.topics import TopicMap
 from rigwake.readers.trajectories import read_trajectory
+from rigwake.recording import Recording
 from rigwake.report import build_report, load_report_content
 from rigwake.tracks import load_tracks
 from rigwake.trajectory import Trajectory
@@ -54,6 +64,18 @@ def _silent(name: str, what: str, fraction: float) -> None:
     """Progress that nobody asked for."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """What a calibration starts with, everything checked. external: trajectories of another odometry, if given."""
+
+    path: Path
+    opened: Recording
+    selection: Selection
+    external: Mapping[str, Trajectory] | None
+    prior: RigPrior
+    config: CalibrateConfig
+
+
 def calibrate(
     recording: Path | str,
     out: Path | str,
@@ -63,27 +85,72 @@ def calibrate(
     trajectories: Path | str | None = None,
     prior: RigPrior | None = None,
     resume: bool = False,
+    force: bool = False,
     progress: Progress = _silent,
 ) -> CalibrationRun:
     """Find where every camera of a recording sits and looks.
 
     out: folder for `calibration.yaml` and what the stages leave; see docs/calibrate.md. trajectories: a folder of
-    `CAMERA.tum` made by another odometry. prior: what is known beforehand. resume: keep finished stages.
+    `CAMERA.tum` made by another odometry. prior: what is known beforehand. resume: keep finished stages. force:
+    replace the result of another run.
 
-    Raises InputError (the recording), UsageError (the settings), UnobservableError (the motion cannot tell),
-    EstimationError (it should, but no trustworthy answer was found). Cameras that fail are left out and named.
+    Raises InputError (the recording), UsageError (the settings, or a folder that holds another result or is in use),
+    UnobservableError (the motion cannot tell), EstimationError (it should, but no trustworthy answer was found),
+    HostError (a process was ended from outside). Cameras that fail are left out and named.
     """
-    config, prior, out = config or CalibrateConfig(), prior or RigPrior(), Path(out)
-    opened = open_recording(recording, topics)
+    path, out, external = Path(recording), Path(out), None if trajectories is None else Path(trajectories)
+    check_out_folder(out, [path], force=force, resume=resume)
+    with unchanged(path) as check_unchanged:
+        prepared = _prepare(path, config or CalibrateConfig(), topics, external, prior or RigPrior())
+        with used_by_one(out):
+            if force:
+                clear_results(out, everything=True)
+            identity = input_fingerprint(path)
+            provenance = _provenance(identity, prepared, topics, external)
+            ledger = StageLedger(out, resume=resume)
+            outcomes = _each_camera(prepared, out, ledger, identity, progress)
+            check_unchanged()
+            estimated = _estimate(prepared, out, outcomes, progress)
+            check_unchanged()
+            return _conclude(prepared, out, outcomes, estimated, provenance, progress)
+
+
+def _prepare(
+    path: Path, config: CalibrateConfig, topics: TopicMap | None, external: Path | None, prior: RigPrior
+) -> _Prepared:
+    """Open the recording and check all that can be checked before an image is read."""
+    opened = open_recording(path, topics)
     selection = select(opened, config)
-    ledger = StageLedger(out, resume=resume)
-    outcomes = _each_camera(selection, Path(recording), out, config, ledger, trajectories is None, progress)
+    check_camera_names(selection.cameras)
+    check_reference(opened, selection, config.reference)
+    check_prior(prior, selection)
+    check_line_delays(config, selection)
+    given = None if external is None else read_external_trajectories(external, selection)
+    return _Prepared(path, opened, selection, given, prior, config)
+
+
+@dataclass(frozen=True, eq=False)
+class _Estimated:
+    """own: the trajectories that were used, by camera."""
+
+    own: Mapping[str, Trajectory]
+    first: InitialRig
+    rig: RigEstimate
+
+
+def _estimate(
+    prepared: _Prepared, out: Path, outcomes: list[CameraOutcome], progress: Progress
+) -> _Estimated:
+    """Initial values and the rig, of the cameras that did not fail."""
+    selection, config = prepared.selection, prepared.config
     working = _working(outcomes)
     tracks = {name: load_tracks(tracks_file(out, name)) for name in working}
-    first = initialise_rig(selection, _trajectories(working, out, trajectories), config, prior)
+    own = _trajectories(working, out, prepared.external)
+    prior = without_cameras(prepared.prior, selection.cameras.keys() - own.keys())
+    first = initialise_rig(selection, own, config, prior)
     save_calibration(first.handeye, out / "initial_rig.yaml")
     rig = estimate_rig(
-        opened,
+        prepared.opened,
         selection,
         tracks,
         first,
@@ -92,13 +159,26 @@ def calibrate(
         masks=out / "masks",
         progress=lambda words, fraction: progress("rig", words, fraction),
     )
-    failed = {o.name: o.failed for o in outcomes if o.failed is not None} | dict(first.failed)
+    return _Estimated(own, first, rig)
+
+
+def _conclude(
+    prepared: _Prepared,
+    out: Path,
+    outcomes: list[CameraOutcome],
+    estimated: _Estimated,
+    provenance: dict[str, Any],
+    progress: Progress,
+) -> CalibrationRun:
+    """Everything that is known of the result, written."""
+    selection, first, rig = prepared.selection, estimated.first, estimated.rig
+    failed = _left_out(prepared, outcomes, estimated.own, first, rig.calibration)
     notes = (*selection.notes, *(f"{o.name}: {n}" for o in outcomes for n in o.notes), *first.notes)
     notes += _noisy_imu(rig.calibration)
     calibration = replace(
         rig.calibration,
         checks={**rig.calibration.checks, "failed_cameras": failed, "notes": list(notes)},
-        provenance=_provenance(Path(recording), config, first),
+        provenance={**provenance, "leader": first.reference_camera},
     )
     write_outputs(out, calibration, rig.adjusted, first, selection, rig.matches)
     progress("rig", "writing the report", 0.95)
@@ -107,37 +187,33 @@ def calibrate(
 
 
 def _each_camera(
-    selection: Selection,
-    recording: Path,
-    out: Path,
-    config: CalibrateConfig,
-    ledger: StageLedger,
-    odometry: bool,
-    progress: Progress,
+    prepared: _Prepared, out: Path, ledger: StageLedger, identity: Mapping[str, Any], progress: Progress
 ) -> list[CameraOutcome]:
     """Mask, tracks and odometry of every camera; those that a former run finished are read from its files."""
-    settings = config.model_dump(
-        include={"tracking", "odometry", "find_self_mask", "seed", "start_s", "duration_s", "imu"}
-    )
-    input_hash = input_fingerprint(recording)
-    # what another version left may lack what this one reads
-    written = [__version__, *(part.name for part in fields(CameraOutcome))]
-    keys = {name: stage_key(input_hash, name, settings, odometry, written) for name in selection.cameras}
+    selection, config, odometry = prepared.selection, prepared.config, prepared.external is None
+    changed_at = files_changed_at(prepared.path)
+    keys = {
+        name: camera_key(stream, selection.imu, config, odometry, identity, changed_at)
+        for name, stream in selection.cameras.items()
+    }
     outcomes: dict[str, CameraOutcome] = {}
     jobs = []
     for name, stream in selection.cameras.items():
-        files = [outcome_file(out, name), tracks_file(out, name)] + (
-            [odometry_file(out, name)] if odometry else []
-        )
-        if ledger.is_done(f"camera {name}", keys[name], *files):
+        if ledger.is_done(f"camera {name}", keys[name], *stage_files(out, name, odometry=odometry)):
             outcomes[name] = load_outcome(out, name)
             progress(name, "taken from the former run", 1.0)
         else:
             jobs.append(CameraJob(stream, selection.imu, out, config, odometry))
-    for outcome in process_cameras(jobs, config.jobs, progress) if jobs else ():
+
+    def finished(outcome: CameraOutcome) -> None:
         outcomes[outcome.name] = outcome
         if outcome.failed is None:
-            ledger.done(f"camera {outcome.name}", keys[outcome.name])
+            files = stage_files(out, outcome.name, odometry=odometry)
+            ledger.done(f"camera {outcome.name}", keys[outcome.name], *files)
+
+    if jobs:
+        clear_results(out, everything=False)
+        process_cameras(jobs, config.jobs, progress, finished)
     return [outcomes[name] for name in selection.cameras]
 
 
@@ -153,23 +229,36 @@ def _working(outcomes: list[CameraOutcome]) -> list[str]:
     )
 
 
-def _trajectories(working: list[str], out: Path, external: Path | str | None) -> dict[str, Trajectory]:
-    """By camera: of our own odometry, or from a folder of another's."""
+def _trajectories(
+    working: list[str], out: Path, external: Mapping[str, Trajectory] | None
+) -> dict[str, Trajectory]:
+    """By camera: of our own odometry, or of another's. Raises InputError if none is left."""
     if external is None:
         return {name: read_trajectory(odometry_file(out, name)).trajectory for name in working}
-    folder = Path(external)
-    found = {
-        name: read_trajectory(path, name=name).trajectory
-        for name in working
-        for path in [folder / f"{name}.tum"]
-        if path.is_file()
-    }
+    found = {name: external[name] for name in working if name in external}
     if not found:
         raise InputError(
-            f"{folder} holds no trajectory of any camera.",
+            "No camera that could be tracked has a trajectory of another odometry.",
             remedy=f"Name the files {', '.join(f'{name}.tum' for name in working)}.",
         )
     return found
+
+
+def _left_out(
+    prepared: _Prepared,
+    outcomes: list[CameraOutcome],
+    own: Mapping[str, Trajectory],
+    first: InitialRig,
+    calibration: Calibration,
+) -> dict[str, str]:
+    """Cameras that are wanted but not in the result, and why."""
+    reasons = dict(prepared.selection.left_out)
+    reasons |= {o.name: o.failed for o in outcomes if o.failed is not None} | dict(first.failed)
+    for name in prepared.config.cameras or prepared.opened.cameras:
+        if name not in calibration.cameras:
+            lacks = prepared.external is not None and name not in own
+            reasons.setdefault(name, "it has no trajectory" if lacks else "nothing ties it to the others")
+    return {name: why for name, why in reasons.items() if name not in calibration.cameras}
 
 
 def _noisy_imu(calibration: Calibration) -> tuple[str, ...]:
@@ -182,12 +271,19 @@ def _noisy_imu(calibration: Calibration) -> tuple[str, ...]:
     )
 
 
-def _provenance(recording: Path, config: CalibrateConfig, first: InitialRig) -> dict[str, Any]:
+def _provenance(
+    identity: Mapping[str, Any], prepared: _Prepared, topics: TopicMap | None, external: Path | None
+) -> dict[str, Any]:
+    used = prepared.external or {}
     return {
         "rigwake": __version__,
         "python": platform.python_version(),
         "libraries": {name: version(name) for name in _LIBRARIES},
-        "inputs": [input_fingerprint(recording)],
-        "settings": config.model_dump(mode="json"),
-        "leader": first.reference_camera,
+        "inputs": [dict(identity)],
+        "topics": {role: dict(names) for role, names in topics.roles.items()} if topics is not None else {},
+        "prior": dict(prepared.prior.origin),
+        "trajectories": {name: input_fingerprint(external / f"{name}.tum") for name in used}
+        if external
+        else {},
+        "settings": prepared.config.model_dump(mode="json"),
     }

@@ -13,7 +13,7 @@ import cv2
 
 from rigwake.atomic import write_text_atomic
 from rigwake.config import CalibrateConfig
-from rigwake.errors import RigwakeError
+from rigwake.errors import HostError, InputError, RigwakeError
 from rigwake.odometry.measure import measure_camera
 from rigwake.odometry.monocular import estimate_monocular
 from rigwake.recording import CameraStream, ImuStream
@@ -61,10 +61,23 @@ def outcome_file(out: Path, camera: str) -> Path:
     return out / "odometry" / f"{camera}.json"
 
 
+def stage_files(out: Path, camera: str, *, odometry: bool) -> list[Path]:
+    """All files that the stage of a camera leaves."""
+    files = [outcome_file(out, camera), tracks_file(out, camera), out / "masks" / f"{camera}.png"]
+    return files + ([odometry_file(out, camera)] if odometry else [])
+
+
 def load_outcome(out: Path, camera: str) -> CameraOutcome:
-    """What `process_camera` wrote."""
-    content = json.loads(outcome_file(out, camera).read_text(encoding="utf-8"))
-    return CameraOutcome(**{**content, "notes": tuple(content["notes"])})
+    """What `process_camera` wrote. Raises InputError."""
+    path = outcome_file(out, camera)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return CameraOutcome(**{**content, "notes": tuple(map(str, content["notes"]))})
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(
+            f"{path} does not say how the stage of {camera} went ({type(error).__name__}: {error}).",
+            remedy="Run the command again without --resume.",
+        ) from error
 
 
 def process_camera(job: CameraJob, report_stage: StageProgress) -> CameraOutcome:
@@ -73,6 +86,8 @@ def process_camera(job: CameraJob, report_stage: StageProgress) -> CameraOutcome
     started, name = time.perf_counter(), job.stream.name
     try:
         outcome = _process(job, report_stage)
+    except HostError:
+        raise  # not the camera's fault: all stop
     except RigwakeError as error:
         outcome = CameraOutcome(name, str(error), unobservable=error.exit_code == 3)
     outcome = replace(outcome, seconds=time.perf_counter() - started)

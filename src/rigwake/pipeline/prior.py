@@ -31,6 +31,7 @@ from rigwake.ba.solver.rig_problem import (
 )
 from rigwake.config import CalibrateConfig
 from rigwake.errors import InputError, UsageError
+from rigwake.fingerprint import input_fingerprint
 from rigwake.geometry.se3 import SE3
 from rigwake.readers.truth_files import read_yaml_mapping
 from rigwake.trajectory import Trajectory
@@ -52,11 +53,15 @@ class Baseline:
 
 @dataclass(frozen=True, eq=False)
 class RigPrior:
-    """Priors of cameras by name (transform and six standard deviations in rig axes), baselines, antenna."""
+    """Priors of cameras by name (transform and six standard deviations in rig axes), baselines, antenna.
+
+    origin: the file that it was read from and what stood in it, for the provenance of a result.
+    """
 
     cameras: Mapping[str, PosePrior] = field(default_factory=dict)
     baselines: tuple[Baseline, ...] = ()
     antenna: VectorPrior | None = None
+    origin: Mapping[str, Any] = field(default_factory=dict)
 
     def applied_to(self, first: InitialRig, config: CalibrateConfig) -> InitialRig:
         """Initial values with these priors, with the scale of a known baseline if there is no other, and with what
@@ -161,7 +166,7 @@ def load_prior(path: Path | str) -> RigPrior:
             f"{path} is no prior: {type(error).__name__}: {error}.",
             remedy="See docs/calibrate.md: cameras.NAME.{rig_from_cam, std}, baselines, antenna.",
         ) from error
-    return RigPrior(cameras, baselines, known)
+    return RigPrior(cameras, baselines, known, {**input_fingerprint(path), "content": dict(content)})
 
 
 def _camera_prior(entry: Mapping[str, Any]) -> PosePrior:

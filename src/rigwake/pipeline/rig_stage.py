@@ -149,11 +149,13 @@ def _conclude(
 
 
 def reference_frame(
-    recording: Recording, selection: Selection, first: InitialRig, wanted: str
+    recording: Recording, selection: Selection, first: InitialRig | None, wanted: str
 ) -> ReferenceFrame:
-    """The frame to report in; `base_link` needs the recording to say where the IMU sits on it."""
+    """The frame to report in; `base_link` needs the recording to say where the IMU sits on it.
+
+    first: needed for `auto` without an IMU only."""
     if wanted == "auto":
-        wanted = "imu" if selection.imu is not None else first.reference_camera
+        wanted = "imu" if selection.imu is not None or first is None else first.reference_camera
     if wanted == "imu" and selection.imu is not None:
         return ReferenceFrame("imu", SE3.identity())
     if wanted == "base_link" and selection.imu is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,14 @@ from rigwake.recording import CameraStream, Frame, FrameSource, GnssStream, ImuS
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What takes part. notes: choices that were made, in words."""
+    """What takes part. notes: choices that were made, in words. left_out: cameras that are wanted but cannot take
+    part, and why."""
 
     cameras: Mapping[str, CameraStream]
     imu: ImuStream | None
     gnss: GnssStream | None
     notes: tuple[str, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +53,9 @@ def select(recording: Recording, config: CalibrateConfig) -> Selection:
             f"{recording.path.name} has no cameras.",
             remedy="`rigwake inspect` lists what it holds; name image topics with --topic camera.front=/a/b.",
         )
-    begin = min(int(c.timestamps_ns[0]) for c in cameras.values() if len(c)) + round(config.start_s * 1e9)
-    end = max(int(c.timestamps_ns[-1]) for c in cameras.values() if len(c))
+    begin = min((int(c.timestamps_ns[0]) for c in cameras.values() if len(c)), default=0)
+    begin += round(config.start_s * 1e9)
+    end = max((int(c.timestamps_ns[-1]) for c in cameras.values() if len(c)), default=0)
     if config.duration_s is not None:
         end = min(end, begin + round(config.duration_s * 1e9))
     if (end - begin) * 1e-9 < config.min_duration_s:
@@ -69,9 +72,11 @@ def select(recording: Recording, config: CalibrateConfig) -> Selection:
         for name in recording.attitudes
     )
     windowed = {name: _window(camera, begin, end) for name, camera in cameras.items()}
+    left_out: dict[str, str] = {}
     for name, camera in list(windowed.items()):
         if camera.model is None:
-            notes.append(f"{name}: left out, it has no intrinsics (`rigwake intrinsics` finds them)")
+            left_out[name] = "it has no intrinsics (`rigwake intrinsics` finds them)"
+            notes.append(f"{name}: left out, {left_out[name]}")
             del windowed[name]
     if not windowed:
         raise InputError(
@@ -79,7 +84,8 @@ def select(recording: Recording, config: CalibrateConfig) -> Selection:
             consequence="Pixels cannot be turned into directions.",
             remedy="Record camera_info, put them into rig.yaml, or find them with `rigwake intrinsics`.",
         )
-    return Selection(windowed, None if imu is None else _with_noise(imu, config, notes), gnss, tuple(notes))
+    known = None if imu is None else _with_noise(imu, config, notes)
+    return Selection(windowed, known, gnss, tuple(notes), left_out)
 
 
 def _one(what: str, streams: Mapping[str, object], wanted: bool, notes: list[str]):  # type: ignore[no-untyped-def]

@@ -56,7 +56,14 @@ def judge(calibration: Calibration) -> ReportVerdict:
         _association(calibration.checks),
     ]
     level: Level = "unobservable" if lost else "good" if all(r.holds for r in reasons) else "usable"
-    return ReportVerdict(level, _SENTENCES[level], tuple(sorted(reasons, key=lambda r: r.holds)))
+    sentence = " ".join(filter(None, (_left_out(calibration.checks), _SENTENCES[level])))
+    return ReportVerdict(level, sentence, tuple(sorted(reasons, key=lambda r: r.holds)))
+
+
+def _left_out(checks: Mapping[str, Any]) -> str:
+    """The cameras that are missing from the result, for the headline."""
+    failed = checks.get("failed_cameras")
+    return f"Without {', '.join(map(str, failed))}." if isinstance(failed, Mapping) and failed else ""
 
 
 def _unobservable(calibration: Calibration) -> list[Reason]:

@@ -54,9 +54,9 @@ class CameraMask:
         written = []
         for stem, region in images.items():
             path = folder / f"{stem}.png"
+            _, encoded = cv2.imencode(".png", region.astype(np.uint8) * 255)
             with atomic_path(path) as temporary:
-                if not cv2.imwrite(str(temporary), region.astype(np.uint8) * 255):
-                    raise InputError(f"{path} cannot be written.")
+                temporary.write_bytes(encoded.tobytes())
             written.append(path)
         return written
 

@@ -1,0 +1,202 @@
+"""Every mistake at the command line ends at once with a code and with words: what is wrong, and what to do."""
+
+import re
+import time
+from pathlib import Path
+
+import pytest
+import typer
+
+from cli_runs import run, write_examples
+from rigwake.cli.main import VERBS, build_app
+
+# (command, exit code, words of the message); names in braces are files of `write_examples`
+WRONG = [
+    # no such command, option, or value
+    ("calibrat x", 2, "No such command 'calibrat'. Did you mean 'calibrate'?"),
+    ("--nonsense", 2, "No such option: --nonsense"),
+    ("calibrate {images} -o {here}/new --nonsense", 2, "No such option: --nonsense"),
+    ("calibrate {images} -o", 2, "requires an argument"),
+    ("calibrate {images} {images}", 2, "unexpected extra argument"),
+    ("calibrate", 2, "No recording was given."),
+    ("calibrate {images} --jobs many", 2, "'--jobs'"),
+    ("calibrate {images} -o {here}/new --jobs -1", 2, "Setting jobs"),
+    ("calibrate {images} -o {here}/new --seed 1.5", 2, "'--seed'"),
+    ("calibrate {images} -o {here}/new --start soon", 2, "'--start'"),
+    ("calibrate {images} -o {here}/new --start -3", 2, "Setting start_s"),
+    ("calibrate {images} -o {here}/new --start inf", 2, "Setting start_s"),
+    ("calibrate {images} -o {here}/new --start nan", 2, "Setting start_s"),
+    ("calibrate {images} -o {here}/new --duration 0", 2, "Setting duration_s"),
+    ("calibrate {images} -o {here}/new --duration inf", 2, "Setting duration_s"),
+    ("calibrate {images} -o {here}/new --set speed=3", 2, "Setting speed"),
+    ("calibrate {images} -o {here}/new --set speed", 2, "is not KEY=VALUE"),
+    ("calibrate {images} -o {here}/new --set seed=[1", 2, "the value is not YAML"),
+    ("calibrate {images} -o {here}/new --config {nowhere}", 1, "There is no file"),
+    ("calibrate {images} -o {here}/new --config {list}", 1, "holds no mapping"),
+    ("calibrate {images} -o {here}/new --config {broken}", 1, "cannot be read as YAML"),
+    (
+        "calibrate {images} -o {here}/new --cameras fornt --set min_duration_s=1",
+        2,
+        "No camera 'fornt' in images.",
+    ),
+    # recordings
+    ("calibrate {nowhere}", 1, "There is no file or folder"),
+    ("calibrate {here}/imagse -o {here}/new", 1, "images meant?"),
+    ("calibrate {text} -o {here}/new", 1, "is not a recording that rigwake knows."),
+    ("calibrate {empty} -o {here}/new", 1, "is not a recording that rigwake knows."),
+    ("calibrate {nmea} -o {here}/new", 1, "has no cameras."),
+    ("calibrate {images} -o {here}/new", 3, "s of images are to be used."),
+    ("calibrate {unlensed} -o {here}/new --set min_duration_s=1", 1, "No camera has intrinsics."),
+    # where the result goes
+    ("calibrate {images} -o {text}", 2, "is a file, a folder is wanted."),
+    ("calibrate {images} -o {text}/inside", 2, "is a file, not a folder"),
+    ("calibrate {images} -o {images}/OUT", 2, "lies inside of"),
+    ("calibrate {images} -o {images}", 2, "lies inside of"),
+    ("calibrate {images} -o ''", 2, "-o names no folder."),
+    ("calibrate {images} -o {here}/" + "x" * 250, 2, "is no possible path."),
+    ("calibrate {images} -o /proc/nothing/here", 2, "cannot be written"),
+    ("calibrate {images} -o {taken}", 2, "holds the result of another run."),
+    ("calibrate {images} -o {taken} --force --resume", 2, "Give one of them."),
+    ("calibrate {images} -o {here}/new --json {empty}", 2, "is a folder, a file is wanted."),
+    ("calibrate {images} -o {here}/new --json {text}/x.json", 2, "is a file, not a folder"),
+    # what is known beforehand
+    ("calibrate {images} -o {here}/new --reference mast --set min_duration_s=1", 2, "'mast' takes no part."),
+    ("calibrate {images} -o {here}/new --reference imu --set min_duration_s=1", 2, "'imu' takes no part."),
+    ("calibrate {images} -o {here}/new --prior {nowhere}", 1, "There is no file"),
+    ("calibrate {images} -o {here}/new --prior {list}", 1, "holds no mapping"),
+    ("calibrate {images} -o {here}/new --prior {calibration}", 1, "unknown keys"),
+    (
+        "calibrate {images} -o {here}/new --prior {prior} --set min_duration_s=1",
+        2,
+        "'lefft' that takes no part",
+    ),
+    ("calibrate {images} -o {here}/new --trajectories {nowhere}", 1, "There is no file or folder"),
+    ("calibrate {images} -o {here}/new --trajectories {text} --set min_duration_s=1", 2, "is no folder."),
+    (
+        "calibrate {images} -o {here}/new --trajectories {empty} --set min_duration_s=1",
+        1,
+        "front.tum, left.tum",
+    ),
+    ("calibrate {images} -o {here}/new --set min_duration_s=1 --set line_delay_s.frnt=1e-5", 2, "'frnt'"),
+    # topics
+    ("inspect {images} --topic front", 2, "is not NAME=TOPIC."),
+    ("inspect {images} --topic radar=/x", 2, "does not say which sensor"),
+    ("inspect {images} --topics {nowhere}", 1, "There is no file"),
+    ("inspect {images} --topics {list}", 1, "is not a YAML mapping."),
+    ("inspect {nowhere}", 1, "There is no file or folder"),
+    ("inspect /dev/zero", 1, "is neither a file nor a folder."),
+    ("inspect {here}/" + "y" * 300, 1, "There is no file or folder"),
+    ("handeye {rig_tum} /dev/zero", 1, "is neither a file nor a folder."),
+    ("inspect ''", 2, "An empty name is no path."),
+    ("inspect", 2, "Missing argument"),
+    ("inspect {images} --html {empty}", 2, "is a folder, a file is wanted."),
+    # odometry
+    ("odometry {images}", 2, "Missing option"),
+    ("odometry {images} -o {here}/new --camera mast", 2, "No camera 'mast'"),
+    ("odometry {images} -o {here}/new --front-end surf", 2, "Choose from klt"),
+    ("odometry {images} -o {here}/new --method best", 2, "Choose from adjusted"),
+    ("odometry {images} -o {here}/new --mask {nowhere}", 1, "There is no file"),
+    ("odometry {images} -o {here}/new --jobs -2", 2, "'--jobs'"),
+    ("odometry {images} -o {images}/new", 2, "lies inside of"),
+    ("odometry {nmea} -o {here}/new", 1, "has no cameras."),
+    # handeye
+    ("handeye {rig_tum}", 2, "Missing argument"),
+    ("handeye {rig_tum} {nowhere}", 1, "There is no file"),
+    ("handeye {rig_tum} {text}", 1, "text.txt"),
+    ("handeye {rig_tum} {port_tum} --noise loud", 2, "Choose from auto"),
+    ("handeye {rig_tum} {port_tum} --method best", 2, "Choose from ml"),
+    ("handeye {rig_tum} {port_tum} -o {empty}", 2, "is a folder, a file is wanted."),
+    # intrinsics
+    ("intrinsics {images}", 2, "Images need a board."),
+    ("intrinsics {nowhere} --board chessboard:9x6:0.03", 1, "There is no file"),
+    ("intrinsics {images} --board chessboard", 2, "board"),
+    ("intrinsics {images} --board triangle:3x3:1", 2, "board"),
+    ("intrinsics {images} --board chessboard:9x6:0.03 --model fisheye", 2, "Choose from pinhole"),
+    ("intrinsics {images} --board chessboard:9x6:0.03 --fov 400", 2, "a number above 0 and below 360"),
+    ("intrinsics {corners}", 2, "needs the image size."),
+    ("intrinsics {corners} --image-size big", 2, "is not WIDTHxHEIGHT."),
+    ("intrinsics {corners} --image-size 0x0", 2, "is not WIDTHxHEIGHT."),
+    # calibrations
+    ("evaluate {calibration} --truth {nowhere}", 1, "There is no file"),
+    ("evaluate {calibration}", 2, "Missing option"),
+    ("evaluate {calibration} --truth {calibration} --gauge loose", 2, "Choose from reference, align"),
+    ("evaluate {nothing} --truth {calibration}", 1, "nothing.yaml"),
+    ("evaluate {calibration} --truth {list}", 1, "list.yaml"),
+    ("diff {calibration}", 2, "Missing argument"),
+    ("diff {calibration} {nowhere}", 1, "There is no file"),
+    ("diff {calibration} {calibration} --range nan", 2, "a number above 0"),
+    ("diff {calibration} {calibration} --range -5", 2, "a number above 0"),
+    ("diff {calibration} {calibration} --range inf", 2, "a number above 0"),
+    ("export {calibration}", 2, "Missing option '--to'"),
+    ("export {calibration} --to xml", 2, "Choose from kalibr"),
+    ("export {calibration} --to kalibr -o {empty}", 1, "it is a folder, where a file is wanted"),
+    ("export {calibration} --to kalibr -o {here}/c.yaml --max-fit-error nan", 2, "a number above 0"),
+    ("export {open} --to kalibr -o {here}/c.yaml", 3, "unobservable"),
+    ("export {broken} --to kalibr", 1, "broken.yaml"),
+    ("export {calibration} --to basalt --imu {nowhere}", 1, "There is no file"),
+    ("report {nowhere}", 1, "There is no file or folder"),
+    ("report {empty}", 1, "holds no calibration.yaml."),
+    ("report {taken} --figures {here}/figures --figure-format gif", 2, "Choose from png, svg"),
+    # simulate
+    ("simulate demo", 2, "-o names the recording."),
+    ("simulate nonsense -o {here}/new.bag", 2, "neither a file nor a preset"),
+    ("simulate demo -o {text}", 2, "is already there."),
+    ("simulate demo -o {here}/new.mp4", 2, "no recording has the suffix .mp4"),
+    ("simulate demo -o {text}/new.bag", 2, "is a file, not a folder"),
+    ("simulate demo -o {here}/new.bag --duration nan", 2, "a number above 0"),
+    ("simulate demo -o {here}/new.bag --duration -1", 2, "a number above 0"),
+    ("simulate demo -o {here}/new.bag --jobs 0", 2, "'--jobs'"),
+    ("simulate {list} -o {here}/new.bag", 2, "list.yaml"),
+    ("demo -o {text}", 2, "is a file, a folder is wanted."),
+]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("wrong")
+    return write_examples(folder) | {"nowhere": folder / "no" / "where"}
+
+
+@pytest.fixture(scope="module")
+def options() -> dict[str, set[str]]:
+    """All options of every verb."""
+    commands = typer.main.get_command(build_app()).commands
+    return {
+        verb: {name for p in commands[verb].params for name in (*p.opts, *p.secondary_opts)}
+        | {"--help", "-h"}
+        for verb in VERBS
+    }
+
+
+def words_of_command(text: str, files: dict[str, Path]) -> list[str]:
+    return ["" if word == "''" else word.format(**files) for word in text.split(" ")]
+
+
+def test_the_table_is_long_enough() -> None:
+    assert len(WRONG) >= 100
+    assert len({command for command, _, _ in WRONG}) == len(WRONG)
+
+
+@pytest.mark.parametrize(("command", "code", "said"), WRONG, ids=[command[:70] for command, _, _ in WRONG])
+def test_wrong_usage(
+    command: str, code: int, said: str, files: dict[str, Path], options: dict[str, set[str]]
+) -> None:
+    before = sorted(files["here"].rglob("*"))
+    started = time.process_time()
+    ended = run(*words_of_command(command, files))
+    assert ended.code == code, ended.words
+    assert "".join(said.split()) in "".join(ended.words.split()), ended.words  # lines may break within a word
+    assert "Traceback" not in ended.err
+    assert time.process_time() - started < 5
+    assert sorted(files["here"].rglob("*")) == before, "something was written"
+    verb = command.split(" ")[0]
+    named = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]+", ended.words.partition("→")[2]))
+    elsewhere = {option for known in options.values() for option in known}
+    assert named <= (elsewhere if verb not in options else options[verb] | elsewhere), named
+
+
+def test_a_link_in_place_of_the_folder_is_followed(files: dict[str, Path], tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(files["taken"])
+    ended = run("calibrate", files["images"], "-o", tmp_path / "link")
+    assert ended.code == 2
+    assert "holds the result of another run." in ended.words
