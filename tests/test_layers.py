@@ -9,7 +9,17 @@ PACKAGE = Path(__file__).parent.parent / "src" / "rigwake"
 
 # left to right; a module may import from its own layer or from any layer further left
 LAYERS = [
-    ["errors", "_types", "atomic", "fingerprint", "parallel", "workers", "kernel_cache"],
+    [
+        "errors",
+        "_types",
+        "atomic",
+        "fingerprint",
+        "parallel",
+        "workers",
+        "kernel_cache",
+        "text_files",
+        "yaml_input",
+    ],
     ["geometry"],
     ["cameras"],
     ["trajectory", "rig"],

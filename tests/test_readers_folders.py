@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from rigwake.geometry import so3
 from rigwake.geometry.geodesy import enu_from_lla, lla_from_enu
 from rigwake.geometry.se3 import SE3
-from rigwake.readers.csv_tables import stamps_from_text
 from rigwake.readers.open import open_recording
+from rigwake.readers.stamp_units import stamps_from_text
 from rigwake.readers.streams import time_order, unit_quaternions
 
 

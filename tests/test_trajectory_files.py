@@ -113,7 +113,7 @@ def test_kitti_times(tmp_path: Path) -> None:
         ("\n".join([ROWS[0], ROWS[0]]), "1 usable pose"),
         ("\n".join([*ROWS, "1006.5 1 2 3"]), "line 6: 4 columns where 8"),
         ("\n".join([*ROWS, "1006.5 1 2 3 a 0 0 1"]), "line 6: not a number"),
-        ("\n".join([*ROWS, "1006.5 1 2 3 0 0 0 0"]), "line 6: a quaternion of norm 0"),
+        ("\n".join([*ROWS, "1006.5 1 2 3 0 0 0 0.5"]), "line 6: a quaternion of norm 0.5"),
         ("\n".join([*ROWS, "1006.5 1 2 3 0 0 0 2"]), "line 6: a quaternion of norm 2"),
         ("\n".join([ROWS[0], *["1 nan 0 0 0 0 0 1"] * 3]), "most rows"),
         ("1 2 3\n4 5 6", "3 columns fit no known"),

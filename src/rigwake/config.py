@@ -6,15 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rigwake.ba.rig.rig_values import AdjustmentOptions
 from rigwake.ba.rig.search_proposals import AssociationOptions
-from rigwake.errors import UsageError
+from rigwake.errors import InputError, UsageError
 from rigwake.odometry.odometry_options import OdometryOptions
-from rigwake.readers.truth_files import read_yaml_mapping
 from rigwake.tracking.tracking_options import TrackingOptions
+from rigwake.yaml_input import parse_yaml, read_yaml_settings
 
 
 class ImuNoiseSettings(BaseModel):
@@ -67,7 +66,7 @@ def load_config(file: Path | None = None, assignments: Sequence[str] = (), **opt
 
     Values of assignments are YAML (`cameras=[front, port]`). Raises UsageError naming the key that is wrong.
     """
-    tree: dict[str, Any] = dict(read_yaml_mapping(file)) if file is not None else {}
+    tree: dict[str, Any] = dict(read_yaml_settings(file)) if file is not None else {}
     for assignment in assignments:
         key, separator, value = assignment.partition("=")
         if not separator:
@@ -75,8 +74,8 @@ def load_config(file: Path | None = None, assignments: Sequence[str] = (), **opt
                 f"--set {assignment!r} is not KEY=VALUE.", remedy="Example: --set tracking.max_features=300"
             )
         try:
-            parsed = yaml.safe_load(value)
-        except yaml.YAMLError as error:
+            parsed = parse_yaml(value, "the value")
+        except InputError as error:
             raise UsageError(f"--set {assignment!r}: the value is not YAML.") from error
         _put(tree, key.strip().split("."), parsed, assignment)
     tree.update({key: value for key, value in options.items() if value is not None})

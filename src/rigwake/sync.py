@@ -34,15 +34,16 @@ class TimeOffset:
     overlap_s: float
 
 
-def angular_speed(trajectory: Trajectory) -> tuple[Array, Array]:
-    """Mid times (N-1,), seconds since the first pose, and angular speeds (N-1,), rad/s; NaN across segments."""
+def angular_speed(trajectory: Trajectory, stride: int = 1) -> tuple[Array, Array]:
+    """Mid times (N - stride,), seconds since the first pose, and angular speeds, rad/s, from each pose to the one
+    `stride` later; NaN across segments."""
     R = trajectory.world_from_body.rotation
-    times = trajectory.times_s
-    angle = np.linalg.norm(so3.log(np.swapaxes(R[:-1], -1, -2) @ R[1:]), axis=-1)
-    speed = angle / np.diff(times)
-    assert trajectory.segment_ids is not None
-    speed[np.diff(trajectory.segment_ids) != 0] = np.nan
-    return (times[:-1] + times[1:]) / 2, speed
+    times, ids = trajectory.times_s, trajectory.segment_ids
+    assert ids is not None
+    angle = np.linalg.norm(so3.log(np.swapaxes(R[:-stride], -1, -2) @ R[stride:]), axis=-1)
+    speed = np.asarray(angle / (times[stride:] - times[:-stride]))
+    speed[ids[stride:] != ids[:-stride]] = np.nan
+    return (times[:-stride] + times[stride:]) / 2, speed
 
 
 def estimate_time_offset(reference: Trajectory, member: Trajectory) -> TimeOffset:
@@ -53,9 +54,17 @@ def estimate_time_offset(reference: Trajectory, member: Trajectory) -> TimeOffse
 
     Raises UnobservableError if the rotation does not vary enough to tell the lag.
     """
-    step = min(float(np.median(np.diff(t.timestamps_ns))) * 1e-9 for t in (reference, member))
+    periods = [float(np.median(np.diff(t.timestamps_ns))) * 1e-9 for t in (reference, member)]
+    step, longest = min(periods), max(periods)
+    # over the same time in both: from one pose to the next a fast trajectory turns by less than its noise
+    strides = [
+        max(1, min(round(longest / p), (len(t) - 1) // 4))
+        for p, t in zip(periods, (reference, member), strict=True)
+    ]
     step = max(step, max(reference.duration_s, member.duration_s) / 200_000)  # bounds memory
-    (a, known_a), (b, known_b) = (_resampled_speed(t, step) for t in (reference, member))
+    (a, known_a), (b, known_b) = (
+        _resampled_speed(t, step, n) for t, n in zip((reference, member), strides, strict=True)
+    )
     lags, score, shared = _normalised_correlation(a, known_a, b, known_b)
     # likelihood of independent samples: a high correlation counts by how long it holds
     best = int(np.argmax(-shared * np.log1p(-(np.clip(score, 0.0, 1 - 1e-9) ** 2))))
@@ -76,9 +85,9 @@ def estimate_time_offset(reference: Trajectory, member: Trajectory) -> TimeOffse
     return TimeOffset(float(offset), float(score[best]), float(shared[best] * step))
 
 
-def _resampled_speed(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:
+def _resampled_speed(trajectory: Trajectory, step_s: float, stride: int) -> tuple[Array, Array]:
     """Angular speed on a grid from the first pose on, and 1 where it is known, 0 in gaps."""
-    times, speed = angular_speed(trajectory)
+    times, speed = angular_speed(trajectory, stride)
     known = np.isfinite(speed)
     grid = np.arange(0.0, trajectory.duration_s + step_s / 2, step_s)
     if known.sum() < 2:

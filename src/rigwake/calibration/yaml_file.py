@@ -14,6 +14,7 @@ from rigwake import __version__
 from rigwake._types import Array
 from rigwake.atomic import write_text_atomic
 from rigwake.calibration.rig_calibration import (
+    AXIS_NAMES,
     CalibratedCamera,
     Calibration,
     KnownOffset,
@@ -22,8 +23,12 @@ from rigwake.calibration.rig_calibration import (
 from rigwake.cameras.registry import camera_from_dict, camera_to_dict
 from rigwake.errors import InputError
 from rigwake.geometry.se3 import SE3
+from rigwake.yaml_input import read_yaml
 
 SCHEMA_VERSION = 1
+_ROUNDING = 1e-4  # a correlation matrix may be so much negative by rounded digits
+_TOUCHED = 0.02
+_REMEDY = "The file is damaged or was edited: export or calibrate again."
 _HEADER = f"""\
 # A calibrated camera rig, written by rigwake {__version__}. Schema: docs/calibration_file.md
 # a_from_b maps coordinates in b to coordinates in a: p_rig = rig_from_cam * p_cam.
@@ -128,9 +133,47 @@ def _optional_float(content: Mapping[str, Any], key: str, where: str) -> float |
     value = content.get(key)
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{where}: {key} must be a number or null, it is {value!r}.")
     return float(value)
+
+
+def _finite(value: Any, shape: tuple[int, ...], where: str) -> Array:
+    array = _floats(value, shape, where)
+    if not np.isfinite(array).all():
+        raise InputError(f"{where} must hold finite numbers, it holds {value!r}.")
+    return array
+
+
+def _covariance(value: Any, size: int, where: str) -> Array:
+    """A covariance in which null marks what is unobservable. InputError if the rest is none."""
+    matrix = _floats(value, (size, size), where)
+    known = np.isfinite(np.diag(matrix))
+    part = matrix[np.ix_(known, known)]
+    if (
+        np.isinf(matrix).any()
+        or not np.isfinite(part).all()
+        or np.abs(part - part.T).max(initial=0) > 1e-6 * np.abs(part).max(initial=0)
+    ):
+        raise InputError(f"{where}: the covariance is not symmetric and finite.", remedy=_REMEDY)
+    scale = np.sqrt(np.maximum(np.diag(part), 1e-300))
+    if (np.diag(part) < 0).any() or np.linalg.eigvalsh(part / np.outer(scale, scale)).min(
+        initial=0
+    ) < -_ROUNDING:
+        raise InputError(f"{where}: the covariance is not positive.", remedy=_REMEDY)
+    return matrix
+
+
+def _null_axes(
+    name: str, rig_from_cam: SE3, unobservable: tuple[UnobservableDirection, ...]
+) -> list[UnobservableDirection]:
+    """A direction for every axis that is null although no entry of `unobservable` touches it."""
+    lost = np.isnan([*rig_from_cam.rotation[:, 0], *rig_from_cam.translation])
+    touched = np.array([np.abs(d.direction) > _TOUCHED for d in unobservable]).reshape(-1, 6).any(axis=0)
+    return [
+        UnobservableDirection(np.eye(6)[axis], f"{AXIS_NAMES[axis]} of {name}")
+        for axis in np.flatnonzero(lost & ~touched)
+    ]
 
 
 def _camera_from_dict(name: str, content: Mapping[str, Any], where: str) -> CalibratedCamera:
@@ -146,16 +189,17 @@ def _camera_from_dict(name: str, content: Mapping[str, Any], where: str) -> Cali
             raise InputError(f"{where}: quat_wxyz has norm {norm:.4g}, not 1.")
         rig_from_cam = SE3.from_quat_wxyz(quat_wxyz, translation)
     covariance = content.get("covariance_cam_axes")
+    unobservable = tuple(
+        UnobservableDirection(
+            _finite(d["direction_rig_axes"], (6,), where), str(d["words"]), str(d.get("remedy", ""))
+        )
+        for d in content.get("undetermined") or ()
+    )
     return CalibratedCamera(
         name=name,
         rig_from_cam=rig_from_cam,
-        covariance=np.full((6, 6), np.nan) if covariance is None else _floats(covariance, (6, 6), where),
-        unobservable=tuple(
-            UnobservableDirection(
-                _floats(d["direction_rig_axes"], (6,), where), str(d["words"]), str(d.get("remedy", ""))
-            )
-            for d in content.get("undetermined") or ()
-        ),
+        covariance=np.full((6, 6), np.nan) if covariance is None else _covariance(covariance, 6, where),
+        unobservable=(*unobservable, *_null_axes(name, rig_from_cam, unobservable)),
         known_offsets=tuple(
             KnownOffset(_floats(k["direction_rig_axes"], (3,), where), float(k["value_m"]), float(k["std_m"]))
             for k in content.get("known_offsets") or ()
@@ -194,13 +238,13 @@ def calibration_from_dict(content: Any, where: str = "calibration") -> Calibrati
         return Calibration(
             reference=str(content["reference"]),
             cameras=cameras,
-            joint_covariance=None if joint is None else _floats(joint, (size, size), where),
+            joint_covariance=None if joint is None else _covariance(joint, size, where),
             antenna_rig=None if antenna is None else _floats(antenna["position_rig_m"], (3,), where),
-            antenna_covariance=None if spread is None else _floats(spread, (3, 3), where),
+            antenna_covariance=None if spread is None else _covariance(spread, 3, where),
             checks=content.get("checks") or {},
             provenance=content.get("provenance") or {},
         )
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise InputError(
             f"{where} is damaged: {type(error).__name__}: {error}.",
             remedy="Compare it with docs/calibration_file.md.",
@@ -209,11 +253,4 @@ def calibration_from_dict(content: Any, where: str = "calibration") -> Calibrati
 
 def load_calibration(path: Path | str) -> Calibration:
     """Read a calibration file; raises InputError that names what is missing or wrong."""
-    path = Path(path)
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.CSafeLoader)
-    except FileNotFoundError as error:
-        raise InputError(f"There is no file {path}.") from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{path} cannot be read as YAML: {error}.") from error
-    return calibration_from_dict(content, str(path))
+    return calibration_from_dict(read_yaml(path), str(path))

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from rigwake.evaluation.rig_errors import CameraDifference
 
 
+_SAME_PX, _SAME_MS = 1e-3, 1e-4
+
+
 def command(
     first: Annotated[Path, typer.Argument(help="A calibration, of any format that export writes.")],
     second: Annotated[Path, typer.Argument(help="Another one of the same rig.")],
@@ -76,3 +79,30 @@ def _print(differences: dict[str, CameraDifference], ranges_m: Sequence[float], 
     if any(d.shift_px for d in differences.values()):
         print_title("shift of a point, px: median / largest over the image")
         out.print(pixels)
+    _print_lenses_and_clocks(differences)
+
+
+def _print_lenses_and_clocks(differences: dict[str, CameraDifference]) -> None:
+    """What the lenses and time offsets differ by; one line where they are the same."""
+    table = figures_table(("camera", "lens px", "offset ms"))
+    for name, d in differences.items():
+        lens = "–" if d.lens_px is None else f"{d.lens_px[0]:.2f} / {d.lens_px[1]:.2f}"
+        if d.sizes_px is not None:
+            lens = "{}x{} / {}x{}".format(*d.sizes_px)
+        table.add_row(escape(name), lens, "–" if d.time_offset_ms is None else f"{d.time_offset_ms:+.3f}")
+    compared = [
+        d for d in differences.values() if (d.lens_px, d.sizes_px, d.time_offset_ms) != (None, None, None)
+    ]
+    if not compared:
+        return
+    same = all(
+        (d.lens_px is None or d.lens_px[1] < _SAME_PX)
+        and d.sizes_px is None
+        and abs(d.time_offset_ms or 0.0) < _SAME_MS
+        for d in compared
+    )
+    if same:
+        out.print("[dim]lenses and time offsets, where both files hold them, are the same[/dim]")
+        return
+    print_title("lenses (px over the image: median / largest; or image sizes) and time offsets differ")
+    out.print(table)

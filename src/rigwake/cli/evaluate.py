@@ -15,12 +15,13 @@ from rigwake.cli.options import JsonOption, completed_from, require, require_the
 
 if TYPE_CHECKING:
     from rigwake.evaluation.rig_errors import RigErrors
+    from rigwake.rig import Rig
 
 
 def command(
     calibration: Annotated[Path, typer.Argument(help="A calibration, of any format that export writes.")],
     truth: Annotated[
-        Path, typer.Option("--truth", help="The known rig: a truth.yaml or another calibration.yaml.")
+        Path, typer.Option("--truth", help="The known rig: a truth.yaml, or a calibration of any format.")
     ],
     gauge: Annotated[
         str,
@@ -29,6 +30,13 @@ def command(
             autocompletion=completed_from(("reference", "align")),
         ),
     ] = "reference",
+    frame: Annotated[
+        str,
+        typer.Option(
+            help="What the transforms of the truth mean: `enu` (rig_from_cam, as it stands), `inverse`, `ned` "
+            "(the rig's axes are forward-right-down), `left-handed`."
+        ),
+    ] = "enu",
     json_file: JsonOption = None,
 ) -> None:
     """Errors of a calibration against a known rig: degrees, metres, and how many of its own sigmas.
@@ -40,12 +48,18 @@ def command(
     require_writable("--json", json_file)
     from rigwake.evaluation.rig_errors import evaluate_calibration
     from rigwake.exporters import UNNAMED_FRAMES, read_calibration
-    from rigwake.readers.truth_files import read_true_rig, rig_in_frame
+    from rigwake.exporters.export_base import refer_to_camera
+    from rigwake.exporters.known_rigs import read_known_rig, rig_in_house_frames
+    from rigwake.readers.truth_files import rig_in_frame
 
     found = read_calibration(calibration)
-    rig = read_true_rig(truth)
+    rig = rig_in_house_frames(read_known_rig(truth), frame)
     if found.reference in UNNAMED_FRAMES:
         found = replace(found, reference=rig.reference)
+    elif rig.reference in UNNAMED_FRAMES:
+        rig = replace(rig, reference=found.reference)
+    elif gauge == "reference" and rig.reference in found.cameras and not _knows(rig, found.reference):
+        found = refer_to_camera(found, rig.reference)
     errors = evaluate_calibration(
         found,
         rig_in_frame(rig, found.reference) if gauge == "reference" else rig,
@@ -62,6 +76,10 @@ def command(
         next_step(
             ["rigwake", "diff", calibration, calibration], "compare calibrations: give another as the second"
         )
+
+
+def _knows(rig: Rig, frame: str) -> bool:
+    return frame == rig.reference or frame in rig.cameras or (frame == "imu" and rig.rig_from_imu is not None)
 
 
 def _print(errors: RigErrors, title: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -49,6 +50,22 @@ def command(
     scale: Annotated[
         bool, typer.Option("--scale", help="Estimate a scale of the others although they claim to be metric.")
     ] = False,
+    columns: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[FILE=]NAMES",
+            help="What the columns hold where the file does not say: `t x y z qw qx qy qz`, `_` for others. "
+            "FILE= for one file only. May be repeated.",
+        ),
+    ] = None,
+    frame: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[FILE=]FRAME",
+            help="What the poses mean: `enu` (world_from_body, right-handed: as it stands), `inverse`, "
+            "`ned`, `left-handed`. FILE= for one file only. May be repeated.",
+        ),
+    ] = None,
 ) -> None:
     """Where bodies sit on one rig, from one trajectory of each: no shared view, any clock, any origin.
 
@@ -64,8 +81,14 @@ def command(
     from rigwake.calibration import save_calibration
     from rigwake.handeye.handeye_result import HandeyeOptions
     from rigwake.handeye.joint_calibration import calibrate_handeye
+    from rigwake.handeye.one_body import in_one_unit
 
-    trajectories = [_read(one) for one in inputs]
+    meanings = [_meaning(one, columns or (), frame or ()) for one in inputs]
+    trajectories = [_read(one, *meaning) for one, meaning in zip(inputs, meanings, strict=True)]
+    for at, member in enumerate(trajectories[1:], start=1):
+        trajectories[at], noticed = in_one_unit(trajectories[0], member)
+        if noticed is not None:
+            err.print(f"[yellow]{escape(noticed.message)}[/yellow]")
     options = HandeyeOptions(
         method="thesis" if method in ("thesis", "seed") else "ml",
         noise=None if noise == "auto" else noise,  # type: ignore[arg-type]
@@ -123,19 +146,38 @@ class _Input:
         return input_fingerprint(self.path) | ({"topic": self.topic} if self.topic else {})
 
 
-def _read(source: _Input) -> Trajectory:
+def _meaning(source: _Input, columns: Sequence[str], frames: Sequence[str]) -> tuple[str | None, str]:
+    """`--columns` and `--frame` of one input: what is said of it by name, else of all."""
+    from rigwake.readers.trajectory_frames import FRAME_MEANINGS
+
+    frame = _said_of(source, frames) or "enu"
+    require("--frame", frame, FRAME_MEANINGS)
+    return _said_of(source, columns), frame
+
+
+def _said_of(source: _Input, options: Sequence[str]) -> str | None:
+    pairs = [text.rpartition("=") for text in options]
+    known = (str(source.path), source.path.name, source.path.stem, source.topic)
+    own = [value for file, sign, value in pairs if sign and file in known]
+    general = [value for _, sign, value in pairs if not sign]
+    return own[-1] if own else general[-1] if general else None
+
+
+def _read(source: _Input, columns: str | None, frame: str) -> Trajectory:
+    from rigwake.readers.held_positions import without_held_positions
     from rigwake.readers.open import open_recording
     from rigwake.readers.topics import TopicMap
     from rigwake.readers.trajectories import read_trajectory
+    from rigwake.readers.trajectory_frames import in_house_frames
 
     if source.topic is None:
-        read = read_trajectory(source.path)
+        read = read_trajectory(source.path, columns=columns, frame=frame)
         trajectory, findings = read.trajectory, read.findings
     else:
         name = source.topic.strip("/").replace("/", "_")
         recording = open_recording(source.path, TopicMap({"pose": {name: source.topic}}))
-        trajectory = recording.poses[name]
-        findings = tuple(f for f in recording.findings if f.sensor == name)
+        trajectory, held = without_held_positions(in_house_frames(recording.poses[name], frame))
+        findings = (*(f for f in recording.findings if f.sensor == name), *held)
     for finding in findings:
         err.print(f"[yellow]{escape(source.path.name)}: {escape(finding.message)}[/yellow]")
     return trajectory

@@ -36,8 +36,8 @@ def command(
     """
     from rigwake.cameras.formats.camera_files import read_camera
     from rigwake.pipeline.undistortion import Target, prepare_undistortion, undistort_files, undistort_stream
-    from rigwake.readers.image_files import IMAGE_SUFFIXES
     from rigwake.readers.open import open_recording
+    from rigwake.readers.picture_files import IMAGE_SUFFIXES
 
     require("--to", to, get_args(Target))
     require_there(*source, camera_file)

@@ -133,7 +133,8 @@ def _camera_error(
     nees = None
     if gauge == "reference" and known.any():
         nees = float(error[known] @ np.linalg.solve(covariance[np.ix_(known, known)], error[known]))
-    offset = None if camera.time_offset_s is None else camera.time_offset_s - true_offset_s
+    is_known = camera.time_offset_s is not None and np.isfinite(true_offset_s)
+    offset = camera.time_offset_s - true_offset_s if camera.time_offset_s is not None and is_known else None
     return CameraDeviation(
         camera.name,
         float(np.rad2deg(np.linalg.norm(error[:3]))),
@@ -167,7 +168,9 @@ class CameraDifference:
 
     translation_mm: (3,) along the axes of the rig. sigmas: the difference in units of both covariances (square
     root of the mean squared whitened difference), None without covariances. shift_px: by range in metres, median
-    and largest displacement over the image of a point at that range; empty without a lens model.
+    and largest displacement over the image of a point at that range; empty without a lens model. lens_px: median and
+    largest displacement over the image by the lenses alone, None where one has none or they are for other image sizes
+    (`sizes_px`: width and height of both where they differ). time_offset_ms: of B minus that of A, None without both.
     """
 
     name: str
@@ -175,6 +178,9 @@ class CameraDifference:
     translation_mm: Array
     sigmas: float | None
     shift_px: dict[float, tuple[float, float]]
+    lens_px: tuple[float, float] | None = None
+    sizes_px: tuple[int, int, int, int] | None = None
+    time_offset_ms: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for `--json`."""
@@ -183,6 +189,8 @@ class CameraDifference:
             "translation_mm": self.translation_mm,
             "sigmas": self.sigmas,
             "shift_px": {f"{r:g}": {"median": m, "max": x} for r, (m, x) in self.shift_px.items()},
+            "lens_px": None if self.lens_px is None else {"median": self.lens_px[0], "max": self.lens_px[1]},
+            "time_offset_ms": self.time_offset_ms,
         }
 
 
@@ -217,18 +225,46 @@ def _difference(a: CalibratedCamera, b: CalibratedCamera, ranges_m: Sequence[flo
     if model is not None and np.isfinite(error).all():
         b_from_a = b.rig_from_cam.inverse() * a.rig_from_cam
         shift = {float(r): _pixel_shift(model, b_from_a, r) for r in ranges_m}
+    offsets_s = (a.time_offset_s, b.time_offset_s)
+    lens_px, sizes_px = _lens_shift(a.model, b.model)
     return CameraDifference(
-        a.name, float(np.rad2deg(np.linalg.norm(error[:3]))), 1e3 * error[3:], sigmas, shift
+        a.name,
+        float(np.rad2deg(np.linalg.norm(error[:3]))),
+        1e3 * error[3:],
+        sigmas,
+        shift,
+        lens_px,
+        sizes_px,
+        None if offsets_s[0] is None or offsets_s[1] is None else 1e3 * (offsets_s[1] - offsets_s[0]),
     )
+
+
+def _lens_shift(
+    first: CameraModel | None, second: CameraModel | None
+) -> tuple[tuple[float, float] | None, tuple[int, int, int, int] | None]:
+    """Median and largest displacement (px) over the image when the lens is exchanged, or the sizes that differ."""
+    if first is None or second is None:
+        return None, None
+    sizes = (first.width_px, first.height_px, second.width_px, second.height_px)
+    if sizes[:2] != sizes[2:]:
+        return None, sizes
+    return _displacement(first, second, SE3.identity(), 1.0), None
 
 
 def _pixel_shift(model: CameraModel, second_from_first: SE3, range_m: float) -> tuple[float, float]:
     """Median and largest displacement (px) over the image of points at one range when the camera is moved."""
-    u = np.linspace(0, model.width_px - 1, 33)
-    v = np.linspace(0, model.height_px - 1, 25)
+    return _displacement(model, model, second_from_first, range_m)
+
+
+def _displacement(
+    first: CameraModel, second: CameraModel, second_from_first: SE3, range_m: float
+) -> tuple[float, float]:
+    """Median and largest displacement (px) over the image of points at one range, from one camera to another."""
+    u = np.linspace(0, first.width_px - 1, 33)
+    v = np.linspace(0, first.height_px - 1, 25)
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    bearings, seen = model.unproject(pixels)
-    moved, still_seen = model.project(second_from_first * (range_m * bearings[seen]))
+    bearings, seen = first.unproject(pixels)
+    moved, still_seen = second.project(second_from_first * (range_m * bearings[seen]))
     if not still_seen.any():
         return float("nan"), float("nan")
     shift = np.linalg.norm(moved - pixels[seen], axis=1)[still_seen]

@@ -31,7 +31,7 @@ from rigwake.exporters.export_base import (
     transform_from_parts,
 )
 from rigwake.exporters.lenses import write_lens
-from rigwake.readers.truth_files import read_yaml_mapping
+from rigwake.yaml_input import read_yaml_settings
 
 _LENSES = ("kb4", "ds", "eucm", "rational")
 _OFFSETS_AGREE_S = 1e-3
@@ -128,7 +128,7 @@ _IMU_KEYS = {
 
 def read_imu_noise(path: Path) -> ExportedImuNoise:
     """Kalibr's imu.yaml, or the `imu0` of OpenVINS' kalibr_imu_chain.yaml."""
-    content: Mapping[str, Any] = read_yaml_mapping(path)
+    content: Mapping[str, Any] = read_yaml_settings(path)
     content = content.get("imu0", content)
     try:
         values = {ours: float(content[theirs]) for ours, theirs in _IMU_KEYS.items()}

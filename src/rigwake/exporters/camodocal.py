@@ -6,6 +6,7 @@ axes, and a blank line. Source: camodocal, `CameraSystem::writePosesToTextFile`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from rigwake.calibration import Calibration
@@ -76,4 +77,9 @@ def _file_name(camera: str) -> str:
 
 def _lens(folder: Path, name: str) -> CameraModel | None:
     file = folder / _file_name(name)
-    return camera_from_camodocal(read_yaml_file(file)) if file.is_file() else None
+    if not file.is_file():
+        return None
+    content = read_yaml_file(file)
+    if not isinstance(content, Mapping):
+        raise InputError(f"{file} holds no lens.")
+    return camera_from_camodocal(content)

@@ -17,11 +17,12 @@ from rigwake._types import Array
 from rigwake.atomic import write_text_atomic
 from rigwake.calibration import CalibratedCamera, Calibration, UnobservableDirection
 from rigwake.calibration.rig_calibration import AXIS_NAMES
-from rigwake.cameras.formats.opencv_yaml import load_yaml
 from rigwake.cameras.protocol import CameraModel
-from rigwake.errors import CameraError, InputError, UnobservableError, UsageError
+from rigwake.errors import InputError, UnobservableError, UsageError
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import nearest_rotation
+from rigwake.text_files import read_text_file
+from rigwake.yaml_input import read_yaml
 
 IMU = "imu"
 ODOMETRY, REF = "odometry", "ref"
@@ -243,30 +244,20 @@ def write_files(files: Mapping[Path, str]) -> Notes:
 
 def read_text(path: Path) -> str:
     """The text of a small file; InputError if it cannot be read or is larger than any calibration."""
-    try:
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise InputError(f"{path} is too large to be a calibration ({path.stat().st_size} bytes).")
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise InputError(f"There is no file {path}.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not a readable text file: {error}.") from error
+    return read_text_file(path, _LARGEST_BYTES)
 
 
 def read_json_file(path: Path) -> Any:
     """The content of a JSON file; InputError if it is none."""
     try:
         return json.loads(read_text(path))
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not JSON: {error}.") from error
 
 
 def read_yaml_file(path: Path) -> Any:
     """The content of a YAML file, with OpenCV's header or without; InputError if it is none."""
-    try:
-        return load_yaml(read_text(path))
-    except (CameraError, RecursionError) as error:
-        raise InputError(f"{path} cannot be read as YAML: {error}") from error
+    return read_yaml(path)
 
 
 _LARGEST_BYTES = 100 * 1024 * 1024  # mrcal keeps its optimisation inputs in the file

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from rigwake.calibration import Calibration, load_calibration
+from rigwake.cameras.slam_lenses import is_orbslam
 from rigwake.errors import InputError, UsageError
 from rigwake.exporters.basalt import read_basalt, write_basalt
 from rigwake.exporters.camodocal import EXTRINSICS, read_camodocal, write_camodocal
@@ -20,10 +22,11 @@ from rigwake.exporters.export_base import (
     read_yaml_file,
 )
 from rigwake.exporters.json_csv import read_csv, read_json, write_csv, write_json
-from rigwake.exporters.kalibr import read_kalibr, write_kalibr, write_openvins
+from rigwake.exporters.kalibr import camchain_keys, read_kalibr, write_kalibr, write_openvins
 from rigwake.exporters.mrcal import SUFFIX, read_mrcal, write_mrcal
 from rigwake.exporters.opencv import is_opencv_rig, read_opencv, write_opencv
 from rigwake.exporters.ros_tf import read_ros_static_tf, write_ros_static_tf
+from rigwake.exporters.slam_settings import is_vins, read_orbslam, read_vins
 from rigwake.exporters.urdf import read_urdf, write_urdf
 
 Writer = Callable[[Calibration, Path, ExportOptions, Notes], Notes]
@@ -66,6 +69,10 @@ FORMATS: Mapping[str, ExportFormat] = {
 }
 
 
+_READ_ONLY: Mapping[str, Reader] = {"vins": read_vins, "orb-slam": read_orbslam}
+_CAMCHAIN = re.compile(r"^(%YAML|[\w\"']+:\s*$|[\w.]+:\s)", re.MULTILINE)
+
+
 def export_calibration(
     calibration: Calibration,
     name: str,
@@ -93,6 +100,8 @@ def read_calibration(path: Path | str) -> Calibration:
     """A calibration in any known format, recognised by its content; InputError says what was expected."""
     path = Path(path)
     name = _recognise(path)
+    if name in _READ_ONLY:
+        return _READ_ONLY[name](path)
     return load_calibration(path) if name == "rigwake" else FORMATS[name].read(path)
 
 
@@ -103,13 +112,14 @@ def _recognise(path: Path) -> str:
         return _recognise_folder(path)
     suffixes = {SUFFIX: "mrcal", ".urdf": "urdf", ".csv": "csv", ".bag": "ros-static-tf"}
     suffixes |= {".launch": "ros-static-tf", ".py": "ros-static-tf", ".mcap": "ros-static-tf"}
-    if path.suffix in suffixes:
-        return suffixes[path.suffix]
-    if path.suffix == ".json":
+    suffix = path.suffix.lower()
+    if suffix in suffixes:
+        return suffixes[suffix]
+    if suffix == ".json":
         return _recognise_json(path)
-    if path.suffix == ".txt":
-        return "camodocal"
-    return _recognise_yaml(path)
+    return (
+        "camodocal" if suffix == ".txt" and not _CAMCHAIN.search(read_text(path)) else _recognise_yaml(path)
+    )
 
 
 def _recognise_folder(path: Path) -> str:
@@ -137,6 +147,11 @@ def _recognise_yaml(path: Path) -> str:
     if is_opencv_rig(read_text(path)):
         return "opencv"
     content = read_yaml_file(path)
-    if isinstance(content, Mapping) and "cam0" in content:
-        return "kalibr"
+    if isinstance(content, Mapping) and "rigwake_calibration" not in content:
+        if is_vins(content):
+            return "vins"
+        if is_orbslam(content):
+            return "orb-slam"
+        if camchain_keys(content):
+            return "kalibr"
     return "rigwake"  # whose reader says best what is wrong with any other YAML

@@ -7,6 +7,7 @@ Sources: kalibr's wiki "yaml formats"; OpenVINS' `kalibr_imucam_chain.yaml` and 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -35,6 +36,7 @@ from rigwake.exporters.lenses import write_lens
 from rigwake.geometry.se3 import SE3
 from rigwake.readers.topics import sensor_names
 
+_CAMERA_KEYS = {"T_cam_imu", "T_imu_cam", "T_cn_cnm1", "camera_model"}
 _KALIBR_LENSES = ("kb4", "mei", "ds", "eucm", "pinhole")
 _OPENVINS_LENSES = ("kb4", "pinhole")
 
@@ -102,17 +104,14 @@ def read_kalibr(path: Path) -> Calibration:
     content = read_yaml_file(path)
     if not isinstance(content, Mapping):
         raise InputError(f"{path} is not a camchain.")
-    keys = sorted((k for k in content if re.fullmatch(r"cam\d+", str(k))), key=lambda k: int(str(k)[3:]))
+    keys = camchain_keys(content)
     entries = [content[key] for key in keys]
     if not all(isinstance(entry, Mapping) for entry in entries):
         raise InputError(f"{path}: a camera of the camchain is not a mapping.")
     names = _names(keys, entries)
-    to_imu = [("T_cam_imu" in e) or ("T_imu_cam" in e) for e in entries]
-    if any(to_imu) and not all(to_imu):
-        raise InputError(f"{path}: only some of the cameras have T_cam_imu or T_imu_cam.")
+    reference, placed = _placed(keys, entries, path)
     cameras: list[CalibratedCamera] = []
-    for key, name, entry in zip(keys, names, entries, strict=True):
-        rig_from_cam = _rig_from_cam(entry, cameras[-1] if cameras else None, all(to_imu), f"{path}: {key}")
+    for key, name, entry, rig_from_cam in zip(keys, names, entries, placed, strict=True):
         shift = entry.get("timeshift_cam_imu")
         cameras.append(
             external_camera(
@@ -123,7 +122,52 @@ def read_kalibr(path: Path) -> Calibration:
                 str(entry.get("rostopic", "")),
             )
         )
-    return external_calibration(IMU if any(to_imu) else names[0] if names else "", cameras, path)
+    return external_calibration(reference or (names[0] if names else ""), cameras, path)
+
+
+def camchain_keys(content: Mapping[Any, Any]) -> list[Any]:
+    """The keys of the cameras: cam0, cam1, ... in the order of their numbers, else all that look like cameras."""
+    numbered = [k for k in content if re.fullmatch(r"cam\d{1,9}", str(k))]
+    if numbered:
+        return sorted(numbered, key=lambda k: int(str(k)[3:]))
+    return [k for k, e in content.items() if isinstance(e, Mapping) and not _CAMERA_KEYS.isdisjoint(e)]
+
+
+def _placed(keys: list[Any], entries: list[Mapping[str, Any]], path: Path) -> tuple[str, list[SE3]]:
+    """IMU (or empty: the first camera) as reference, and `rig_from_cam` of all.
+
+    One camera's place relative to the IMU is enough: `T_cn_cnm1` leads on from it in both directions.
+    """
+    links = [
+        transform_from_matrix(entry["T_cn_cnm1"], f"{path}: {key}: T_cn_cnm1")
+        if "T_cn_cnm1" in entry
+        else None
+        for key, entry in zip(keys, entries, strict=True)
+    ]
+    known = [_to_imu(entry, f"{path}: {key}") for key, entry in zip(keys, entries, strict=True)]
+    reference = IMU if any(x is not None for x in known) else ""
+    if not reference and known:
+        known[0] = SE3.identity()
+    for at in range(1, len(known)):
+        before, link = known[at - 1], links[at]
+        if known[at] is None and before is not None and link is not None:
+            known[at] = before * link.inverse()
+    for at in range(len(known) - 1, 0, -1):
+        after, link = known[at], links[at]
+        if known[at - 1] is None and after is not None and link is not None:
+            known[at - 1] = after * link
+    lost = [str(key) for key, x in zip(keys, known, strict=True) if x is None]
+    if lost:
+        raise InputError(
+            f"{path}: {', '.join(lost)} has neither T_cam_imu (T_imu_cam) nor T_cn_cnm1 to a camera that has."
+        )
+    return reference, [x for x in known if x is not None]
+
+
+def _to_imu(entry: Mapping[str, Any], where: str) -> SE3 | None:
+    if "T_imu_cam" in entry:
+        return transform_from_matrix(entry["T_imu_cam"], where)
+    return transform_from_matrix(entry["T_cam_imu"], where).inverse() if "T_cam_imu" in entry else None
 
 
 def _names(keys: list[Any], entries: list[Mapping[str, Any]]) -> list[str]:
@@ -135,21 +179,11 @@ def _names(keys: list[Any], entries: list[Mapping[str, Any]]) -> list[str]:
     return [str(entry.get("camera_name", key)) for key, entry in zip(keys, entries, strict=True)]
 
 
-def _rig_from_cam(
-    entry: Mapping[str, Any], previous: CalibratedCamera | None, to_imu: bool, where: str
-) -> SE3:
-    if "T_imu_cam" in entry:
-        return transform_from_matrix(entry["T_imu_cam"], where)
-    if to_imu:
-        return transform_from_matrix(entry["T_cam_imu"], where).inverse()
-    if previous is None:
-        return SE3.identity()
-    if "T_cn_cnm1" not in entry:
-        raise InputError(f"{where} has neither T_cam_imu nor T_cn_cnm1.")
-    return previous.rig_from_cam * transform_from_matrix(entry["T_cn_cnm1"], where).inverse()
-
-
 def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{where} must be a number, it is {value!r}.")
-    return float(value)
+    try:
+        number = float("nan") if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where} must be a number, it is {value!r}.") from error
+    if not math.isfinite(number):
+        raise InputError(f"{where} must be a finite number, it is {value!r}.")
+    return number

@@ -18,6 +18,7 @@ from rigwake.handeye.likelihood import HandeyeEstimate, maximise
 from rigwake.handeye.motions import Mounting
 from rigwake.handeye.noise_selection import without_drift
 from rigwake.handeye.observability import covariance, unobservable_directions
+from rigwake.handeye.one_body import require_one_body
 from rigwake.handeye.thesis_handeye import thesis_handeye
 from rigwake.sync import MIN_OVERLAP, estimate_time_offset
 from rigwake.trajectory import Trajectory
@@ -49,6 +50,8 @@ def calibrate_handeye(
             consequence="The motion or the trajectories do not support the model.",
             remedy="Look at the trajectories: do they show one rigid body? Try --noise poses or increments.",
         )
+    for member, mounting in zip(members, estimate.mountings, strict=True):
+        require_one_body(reference, member, mounting.ref_from_member, mounting.time_offset_s)
     return _result(problem, estimate, options)
 
 

@@ -33,11 +33,12 @@ from rigwake.config import CalibrateConfig
 from rigwake.errors import InputError, UsageError
 from rigwake.fingerprint import input_fingerprint
 from rigwake.geometry.se3 import SE3
-from rigwake.readers.truth_files import read_yaml_mapping
 from rigwake.trajectory import Trajectory
+from rigwake.yaml_input import read_yaml_settings
 
 # as good as nothing, yet it keeps an offset that nothing determines, and whatever it draws along, from running away
 _ABOARD_STD_M = 10.0
+_UNIT = 0.05
 _FIXED_STD = 1e-7  # radians or metres: what a fixed degree of freedom is held with
 
 
@@ -145,7 +146,7 @@ def _scaled(first: InitialRig, baselines: tuple[Baseline, ...]) -> InitialRig:
 def load_prior(path: Path | str) -> RigPrior:
     """Read a prior; raises InputError that names what is wrong."""
     path = Path(path)
-    content = read_yaml_mapping(path)
+    content = read_yaml_settings(path)
     unknown = set(content) - {"cameras", "baselines", "antenna"}
     if unknown:
         raise InputError(f"{path}: unknown keys {', '.join(sorted(map(str, unknown)))}.")
@@ -173,7 +174,10 @@ def _camera_prior(entry: Mapping[str, Any]) -> PosePrior:
     transform, std = entry["rig_from_cam"], entry.get("std") or {}
     quat = transform.get("quat_wxyz")
     translation = transform.get("translation_m")
-    mean = SE3.from_quat_wxyz([1, 0, 0, 0] if quat is None else quat, _vector(translation, 0.0))
+    quat_wxyz = np.array([1.0, 0.0, 0.0, 0.0] if quat is None else quat, dtype=np.float64)
+    if quat_wxyz.shape != (4,) or not abs(np.linalg.norm(quat_wxyz) - 1) < _UNIT:
+        raise ValueError(f"quat_wxyz must be four numbers of norm 1, not {quat!r}")
+    mean = SE3.from_quat_wxyz(quat_wxyz, _vector(translation, 0.0))
     nothing = [None, None, None]
     rotation_std = _std(nothing if quat is None else std.get("rotation_deg", nothing), np.deg2rad(1.0))
     translation_std = _std(nothing if translation is None else std.get("translation_m", nothing), 1.0)

@@ -11,29 +11,35 @@ from numpy.typing import NDArray
 from rigwake._types import Array, Stamps
 from rigwake.errors import InputError
 from rigwake.geometry import so3
-from rigwake.geometry.geodesy import enu_from_lla
 from rigwake.readers.csv_tables import Table, read_table
+from rigwake.readers.gnss_fixes import gnss_stream_of_fixes
+from rigwake.readers.imu_units import (
+    accel_in_si,
+    gyro_in_si,
+    headerless_columns,
+    inertial_columns,
+    unit_words,
+)
 from rigwake.readers.streams import symmetric_psd, unit_quaternions, usable_rows
 from rigwake.recording import AttitudeStream, Finding, GnssStream, ImuStream
 
 Findings = tuple[Finding, ...]
-_GYRO = (
-    ("gyro_x", "gyro_y", "gyro_z"),
-    ("w_rs_s_x", "w_rs_s_y", "w_rs_s_z"),
-    ("wx", "wy", "wz"),
-    ("angular_velocity_x", "angular_velocity_y", "angular_velocity_z"),
+_HEADERLESS_IMU = ("t", "first_x", "first_y", "first_z", "second_x", "second_y", "second_z")
+_LATITUDE_LONGITUDE = (
+    ("latitude", "longitude"),
+    ("lat", "lon"),
+    ("lat", "lng"),
+    ("lat", "long"),
+    ("latitude_deg", "longitude_deg"),
+    ("lat_deg", "lon_deg"),
 )
-_ACCEL = (
-    ("accel_x", "accel_y", "accel_z"),
-    ("a_rs_s_x", "a_rs_s_y", "a_rs_s_z"),
-    ("ax", "ay", "az"),
-    ("linear_acceleration_x", "linear_acceleration_y", "linear_acceleration_z"),
+_HEIGHT = (
+    *("altitude", "alt", "height", "ellipsoidal_height", "hgt", "elevation"),
+    *("altitude_m", "alt_m", "height_m"),
 )
-_LLA = (("latitude", "longitude", "altitude"), ("lat", "lon", "alt"), ("lat", "lon", "height"))
 _ENU_COVARIANCE = ("cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu")
 _BODY_COVARIANCE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 _UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-UNKNOWN_GNSS_VARIANCE = 25.0
 
 
 def _usable(table: Table, name: str, *columns: Array) -> tuple[NDArray[np.int64], Stamps, Findings]:
@@ -42,16 +48,21 @@ def _usable(table: Table, name: str, *columns: Array) -> tuple[NDArray[np.int64]
     Raises InputError if there is none.
     """
     stamps = table.stamps_ns()
-    readable = np.flatnonzero(stamps >= 0)
+    readable, dropped = _readable(table, name)
     kept, repaired = usable_rows(name, stamps[readable], *(column[readable] for column in columns))
     rows = readable[kept]
     if not len(rows):
         raise InputError(f"{table.path} holds no readable row.")
-    unreadable = len(stamps) - len(readable) + table.dropped_rows
-    if unreadable == 0:
-        return rows, stamps[rows], repaired
+    return rows, stamps[rows], (*dropped, *repaired)
+
+
+def _readable(table: Table, name: str) -> tuple[NDArray[np.int64], Findings]:
+    """Rows with readable stamps, and how many are not."""
+    stamps = table.stamps_ns()
+    rows = np.flatnonzero(stamps >= 0)
+    unreadable = len(stamps) - len(rows) + table.dropped_rows
     message = f"{unreadable} rows of {table.path.name} cannot be read; they were dropped."
-    return rows, stamps[rows], (Finding("warning", name, message), *repaired)
+    return rows, (Finding("warning", name, message),) if unreadable else ()
 
 
 def _symmetric(table: Table, columns: Sequence[str], rows: NDArray[np.int64]) -> Array:
@@ -63,31 +74,60 @@ def _symmetric(table: Table, columns: Sequence[str], rows: NDArray[np.int64]) ->
 
 def read_imu_csv(path: Path, name: str) -> tuple[ImuStream, Findings]:
     """IMU samples (rad/s, m/s^2). Raises InputError if columns are missing or no row is usable."""
-    table = read_table(path)
-    gyro, accel = table.numbers(*_GYRO), table.numbers(*_ACCEL)
+    table = read_table(path, names=_HEADERLESS_IMU)
+    gyro_columns, accel_columns, said = _inertial_columns(table, name)
+    gyro, gyro_said = gyro_in_si(table.numbers(gyro_columns), _unit(table, gyro_columns[0]), name)
+    accel, accel_said = accel_in_si(table.numbers(accel_columns), _unit(table, accel_columns[0]), name)
     rows, stamps, findings = _usable(table, name, gyro, accel)
-    return ImuStream(name, stamps, gyro[rows], accel[rows], path.name), findings
+    stream = ImuStream(name, stamps, gyro[rows], accel[rows], path.name)
+    return stream, (*said, *gyro_said, *accel_said, *findings)
+
+
+def _unit(table: Table, column: str) -> str:
+    return unit_words(column, table.units[column])
+
+
+def _inertial_columns(table: Table, name: str) -> tuple[tuple[str, ...], tuple[str, ...], Findings]:
+    """Columns of gyroscope and accelerometer by name; without a header by the size of gravity."""
+    if tuple(table.columns) == _HEADERLESS_IMU:
+        values = table.numbers(_HEADERLESS_IMU)
+        places = headerless_columns(values[np.isfinite(values).all(axis=1)]) if len(values) else None
+        if places is None:
+            raise InputError(
+                f"{table.path} has no header line.", remedy="Name its columns in the first line."
+            )
+        gyro, accel = (tuple(_HEADERLESS_IMU[at] for at in place) for place in places)
+        order = "gyroscope, accelerometer" if places[0][0] == 1 else "accelerometer, gyroscope"
+        message = f"{table.path.name} has no header line: read as time, {order}, by the size of gravity."
+        return gyro, accel, (Finding("warning", name, message),)
+    found = inertial_columns(list(table.columns))
+    if found is None:
+        raise InputError(
+            f"{table.path} lacks the columns gyro_x, gyro_y, gyro_z, accel_x, accel_y, accel_z.",
+            remedy=f"It has {', '.join(table.columns)}; name them so.",
+        )
+    return *found, ()
 
 
 def read_gnss_csv(path: Path, name: str) -> tuple[GnssStream, Findings]:
     """Satellite positions in the plane tangent at the first. Raises InputError as `read_imu_csv`."""
     table = read_table(path)
-    lla = table.numbers(*_LLA)
-    lla[np.abs(lla[:, 0]) > 90] = np.nan
-    rows, stamps, findings = _usable(table, name, lla)
-    origin = (float(lla[rows[0], 0]), float(lla[rows[0], 1]), float(lla[rows[0], 2]))
+    place = table.numbers(*_LATITUDE_LONGITUDE)
+    height = table.find(*_HEIGHT)
+    heights = table.numbers((height,)) if height else np.full((len(place), 1), np.nan)
+    lla = np.concatenate([place, heights], axis=1)
+    readable, dropped = _readable(table, name)
     velocity_columns = ("velocity_e", "velocity_n", "velocity_u")
-    velocity = table.numbers(velocity_columns)[rows] if table.find(velocity_columns[0]) else None
-    stream = GnssStream(
+    velocity = table.numbers(velocity_columns)[readable] if table.find(velocity_columns[0]) else None
+    stream, findings = gnss_stream_of_fixes(
         name,
-        stamps,
-        enu_from_lla(lla[rows], origin),
-        symmetric_psd(_symmetric(table, _ENU_COVARIANCE, rows), UNKNOWN_GNSS_VARIANCE),
-        origin,
-        velocity,
-        path.name,
+        table.stamps_ns()[readable],
+        lla[readable],
+        _symmetric(table, _ENU_COVARIANCE, readable),
+        velocity_enu=velocity,
+        topic=path.name,
     )
-    return stream, findings
+    return stream, (*dropped, *findings)
 
 
 def read_attitude_csv(path: Path, name: str) -> tuple[AttitudeStream, Findings]:

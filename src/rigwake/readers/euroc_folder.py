@@ -16,12 +16,13 @@ from rigwake.readers.csv_sensors import read_imu_csv
 from rigwake.readers.csv_tables import read_table
 from rigwake.readers.image_files import FileFrames, first_file_size
 from rigwake.readers.images import ImageSize
-from rigwake.readers.rig_file import read_yaml_mapping, rigid_transform
+from rigwake.readers.rig_file import rigid_transform
 from rigwake.readers.streams import time_order
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.recording import CameraStream, Finding, ImuStream, Recording
 from rigwake.rig import Rig, RigCamera
 from rigwake.trajectory import Trajectory
+from rigwake.yaml_input import read_yaml_settings
 
 _TRUTH_FOLDERS = ("state_groundtruth_estimate0",)
 _POSE_FOLDERS = ("vicon0", "mocap0")
@@ -83,7 +84,7 @@ def _kalibr_chain(path: Path, found: _EurocStreams) -> dict[str, Mapping[str, An
     if not path.is_file():
         return {}
     try:
-        return {str(n): entry for n, entry in read_yaml_mapping(path).items() if isinstance(entry, dict)}
+        return {str(n): entry for n, entry in read_yaml_settings(path).items() if isinstance(entry, dict)}
     except InputError as error:
         found.findings.append(Finding("warning", "", error.cause))
         return {}
@@ -124,7 +125,7 @@ def _camera_settings(
     name = folder.name
     try:
         if (folder / "sensor.yaml").is_file():
-            settings = read_yaml_mapping(folder / "sensor.yaml")
+            settings = read_yaml_settings(folder / "sensor.yaml")
             body_from_cam = _matrix(settings.get("T_BS"), f"{name}: T_BS")
             coefficients = settings.get("distortion_coefficients", [])
         elif kalibr is not None:
@@ -173,7 +174,7 @@ def _add_imu(folder: Path, found: _EurocStreams) -> None:
     stream, repaired = read_imu_csv(folder / "data.csv", folder.name)
     found.findings += repaired
     if (folder / "sensor.yaml").is_file():
-        settings = read_yaml_mapping(folder / "sensor.yaml")
+        settings = read_yaml_settings(folder / "sensor.yaml")
         stream = replace(
             stream,
             gyro_noise_density=_positive(settings.get("gyroscope_noise_density")),

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-
 from rigwake._types import Stamps
+from rigwake.cameras.formats.camera_files import read_cameras
 from rigwake.cameras.protocol import CameraModel
-from rigwake.errors import InputError
+from rigwake.errors import CameraError, InputError
 from rigwake.readers.csv_sensors import read_attitude_csv, read_gnss_csv, read_imu_csv
-from rigwake.readers.csv_tables import read_table, stamps_from_text
-from rigwake.readers.image_files import (
-    IMAGE_SUFFIXES,
-    VIDEO_SUFFIXES,
-    FileFrames,
-    VideoFrames,
-    first_file_size,
-    image_files,
-    index_video,
-)
+from rigwake.readers.frame_lists import LIST_ENDINGS, frames_of_folder, read_frame_list
+from rigwake.readers.image_files import file_frames, image_files
+from rigwake.readers.images import ImageSize
 from rigwake.readers.nmea import read_nmea
+from rigwake.readers.nmea_sentences import looks_like_nmea
+from rigwake.readers.picture_files import swaps_sides
 from rigwake.readers.rig_file import read_rig_file
 from rigwake.readers.streams import time_order
 from rigwake.readers.trajectories import read_trajectory
+from rigwake.readers.video_files import VIDEO_SUFFIXES, VideoFrames, index_video
 from rigwake.recording import (
     AttitudeStream,
     CameraStream,
@@ -38,9 +34,12 @@ from rigwake.recording import (
 from rigwake.rig import Rig
 from rigwake.trajectory import Trajectory
 
-_NOMINAL_PERIOD_NS = 100_000_000
-_STAMP_DIGITS = 16  # a file name of so many digits is a stamp in microseconds or nanoseconds
-_TABLES = ("imu", "gnss", "attitude")
+_TABLES = {"imu": "imu", "gnss": "gnss", "gps": "gnss", "attitude": "attitude"}
+_TABLE_NAME = re.compile(r"(imu|gnss|gps|attitude)\d*(?:[_-].*)?")
+_TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".dat")
+_LOG_SUFFIXES = (".nmea", ".log", ".ubx", ".txt", ".dat", ".nma")
+_LENS_FILES = ("rig.yaml", "cameras.yaml", "intrinsics.yaml", "camchain.yaml", "calibration.yaml", "rig.yml")
+_START_BYTES = 65536
 
 
 @dataclass
@@ -61,20 +60,20 @@ def is_plain_folder(path: Path) -> bool:
 
 
 def _table_of(path: Path) -> str | None:
-    """`imu` for `imu.csv`, `imu_port.csv` and so on."""
-    name = path.stem.split("_")[0] if path.suffix == ".csv" else ""
-    return name if name in _TABLES else None
+    """`imu` for `imu.csv`, `imu0.csv`, `imu_port.csv` and so on."""
+    found = _TABLE_NAME.fullmatch(path.stem.lower()) if path.suffix.lower() in _TABLE_SUFFIXES else None
+    return _TABLES[found[1]] if found is not None else None
 
 
 def read_folder(path: Path) -> Recording:
     """Read a plain folder. Raises InputError if no sensor of it can be read."""
     found = _FolderStreams(path)
-    if (path / "rig.yaml").is_file():
-        found.models, found.rig = read_rig_file(path / "rig.yaml")
+    _find_lenses(found)
     flat = [path] if image_files(path) else []
     for entry in [*flat, *sorted(path.iterdir())]:
         add = _adder(entry)
         if add is None:
+            _mention(entry, found)
             continue
         try:
             add(entry, found)
@@ -97,54 +96,103 @@ def read_folder(path: Path) -> Recording:
     )
 
 
+def _find_lenses(found: _FolderStreams) -> None:
+    """Lenses, and the rig where it is known, of `rig.yaml` or of any camera file of the usual names."""
+    path = next((found.root / name for name in _LENS_FILES if (found.root / name).is_file()), None)
+    if path is None:
+        return
+    if path.stem == "rig":
+        try:
+            found.models, found.rig = read_rig_file(path)
+        except InputError as error:
+            found.models = _lenses(path)
+            if not found.models:
+                raise error from None
+        if found.models or found.rig:
+            return
+    found.models = _lenses(path)
+    if not found.models:
+        found.findings.append(Finding("warning", "", f"{path.name} holds no lens that is known here."))
+
+
+def _lenses(path: Path) -> dict[str, CameraModel]:
+    try:
+        return read_cameras(path)
+    except (InputError, CameraError):
+        return {}
+
+
+def _mention(entry: Path, found: _FolderStreams) -> None:
+    """A note for tables that are read as no sensor, so that nothing is lost without a word."""
+    is_list = entry.name in ("timestamps.csv", "times.csv") or entry.stem.endswith("_timestamps")
+    is_of_camera = (entry.parent / entry.stem).is_dir()
+    if entry.is_file() and entry.suffix.lower() == ".csv" and not is_list and not is_of_camera:
+        message = f"{entry.name} is not read: name it imu.csv, gnss.csv or attitude.csv if it is one."
+        found.findings.append(Finding("note", entry.stem, message))
+
+
 def _adder(entry: Path) -> Callable[[Path, _FolderStreams], None] | None:
     suffix = entry.suffix.lower()
     if entry.is_dir():
         return _add_images if image_files(entry) else None
+    if not entry.is_file():
+        return None
     if suffix in VIDEO_SUFFIXES:
         return _add_video
-    return _add_nmea if suffix == ".nmea" else _ADD_TABLE.get(_table_of(entry) or "")
+    if suffix in _LOG_SUFFIXES and (suffix == ".nmea" or _holds_nmea(entry)):
+        return _add_nmea
+    return _ADD_TABLE.get(_table_of(entry) or "")
+
+
+def _holds_nmea(entry: Path) -> bool:
+    try:
+        with entry.open("rb") as file:
+            return looks_like_nmea(file.read(_START_BYTES))
+    except OSError:
+        return False
+
+
+def _free_name(entry: Path, taken: Mapping[str, object], found: _FolderStreams) -> str:
+    """The stem of a file or folder; where another sensor has it, the suffix is added, and that is said."""
+    name = entry.stem if entry.is_file() else entry.name
+    if name not in taken:
+        return name
+    longer = f"{name}_{entry.suffix.lstrip('.').lower() or 'folder'}"
+    while longer in taken:
+        longer += "_"
+    message = f"{entry.name} has the name of another sensor: it is called {longer}."
+    found.findings.append(Finding("note", longer, message))
+    return longer
 
 
 def _add_images(folder: Path, found: _FolderStreams) -> None:
-    name = "camera" if folder == found.root else folder.name
-    listed = folder / "timestamps.csv"
-    shared = found.root / "timestamps.csv"
-    if listed.is_file() or shared.is_file():
-        names, stamps = _listed(listed if listed.is_file() else shared, name, folder, found.findings)
-    else:
-        names, stamps = _unlisted(name, folder, found.findings)
+    name = "camera" if folder == found.root else _free_name(folder, found.cameras, found)
+    files, stamps = frames_of_folder(folder, found.root, name, found.findings)
     order, repaired = time_order(name, stamps)
-    chosen, stamps = tuple(names[at] for at in order), stamps[order]
-    size = first_file_size([folder / file for file in chosen])
+    chosen, stamps = tuple(files[at] for at in order), stamps[order]
+    source, orientation = file_frames(folder, chosen, stamps)
+    size = source.size
     found.findings += repaired
-    _add_camera(name, FileFrames(folder, chosen, stamps, size), size, stamps, found)
+    if orientation > 1:
+        turned = ImageSize(size.height_px, size.width_px)
+        upright = swaps_sides(orientation) and _fits(found, name, turned) and not _fits(found, name, size)
+        if upright:
+            source, size = replace(source, size=turned, upright=True), turned
+        _say_turned(found, name, f"EXIF orientation {orientation}", upright)
+    _add_camera(name, source, size, stamps, found)
 
 
-def _listed(table_path: Path, name: str, folder: Path, findings: list[Finding]) -> tuple[list[str], Stamps]:
-    """Frames by a table `timestamp, filename` (and `camera`, where it serves several)."""
-    table = read_table(table_path)
-    stamps = table.stamps_ns()
-    column = table.find("filename", "file", "image", "frame")
-    if column is None:
-        raise InputError(f"{table_path} lacks a column filename.")
-    cameras = table.columns.get("camera", [name] * len(stamps))
-    rows = [row for row, camera in enumerate(cameras) if camera == name]
-    files = [Path(table.columns[column][row].replace("\0", "")).name for row in rows]
-    kept = [at for at, row in enumerate(rows) if stamps[row] >= 0 and (folder / files[at]).is_file()]
-    kept = [at for at in kept if Path(files[at]).suffix.lower() in IMAGE_SUFFIXES]
-    if len(kept) < len(rows) or table.dropped_rows:
-        message = f"{len(rows)} frames listed, {len(kept)} usable; the rest is left out."
-        findings.append(Finding("warning", name, message))
-    return [files[at] for at in kept], stamps[[rows[at] for at in kept]]
+def _fits(found: _FolderStreams, name: str, size: ImageSize) -> bool:
+    model = found.models.get(name)
+    return model is not None and (model.width_px, model.height_px) == tuple(size)
 
 
-def _unlisted(name: str, folder: Path, findings: list[Finding]) -> tuple[list[str], Stamps]:
-    files = image_files(folder)
-    if all(file.stem.isascii() and file.stem.isdigit() and len(file.stem) >= _STAMP_DIGITS for file in files):
-        return [file.name for file in files], stamps_from_text([file.stem for file in files])
-    findings.append(Finding("warning", name, "no timestamps.csv: 10 Hz is assumed."))
-    return [file.name for file in files], np.arange(len(files), dtype=np.int64) * _NOMINAL_PERIOD_NS
+def _say_turned(found: _FolderStreams, name: str, flag: str, turned: bool) -> None:
+    done = "turned so, since the intrinsics are of that size" if turned else "read as stored, not turned"
+    message = (
+        f"the files ask viewers to turn them ({flag}): {done}. Intrinsics must be of the images as read."
+    )
+    found.findings.append(Finding("note" if turned else "warning", name, message))
 
 
 def _add_camera(
@@ -164,35 +212,49 @@ def _add_camera(
 
 
 def _add_video(path: Path, found: _FolderStreams) -> None:
+    name = _free_name(path, found.cameras, found)
     index = index_video(path)
     stamps = index.stamps_ns()
-    listed = path.with_name(f"{path.stem}_timestamps.csv")
-    if listed.is_file():
-        given = read_table(listed).stamps_ns()
-        if len(given) != len(stamps):
-            raise InputError(f"{listed.name} has {len(given)} rows, the video {len(stamps)} frames.")
-        stamps = given
+    if index.missing:
+        found.findings.append(Finding("error", name, f"{path.name} is cut off: {index.missing}."))
+    names = [f"{path.stem}{ending}" for ending in LIST_ENDINGS]
+    listed = next((path.with_name(file) for file in names if path.with_name(file).is_file()), None)
+    frames = None if listed is None else read_frame_list(listed)
+    if frames is not None and listed is not None:
+        if len(frames.stamps) != len(stamps):
+            raise InputError(f"{listed.name} has {len(frames.stamps)} rows, the video {len(stamps)} frames.")
+        stamps = frames.stamps
     else:
         message = "a video without a table of stamps has its own clock, from 0 at its first frame."
-        found.findings.append(Finding("warning", path.stem, message))
-    order, repaired = time_order(path.stem, stamps)
+        found.findings.append(Finding("warning", name, message))
+    order, repaired = time_order(name, stamps)
     found.findings += repaired
     index = replace(index, ticks=tuple(index.ticks[at] for at in order))
-    _add_camera(path.stem, VideoFrames(path, index, stamps[order]), index.size, stamps[order], found)
+    size, turned_deg = index.size, 0
+    if index.rotation_deg:
+        swapped = ImageSize(size.height_px, size.width_px)
+        quarter = index.rotation_deg in (90, 270)
+        if quarter and _fits(found, name, swapped) and not _fits(found, name, size):
+            size, turned_deg = swapped, index.rotation_deg
+        _say_turned(found, name, f"rotation by {index.rotation_deg} deg", bool(turned_deg))
+    _add_camera(name, VideoFrames(path, index, stamps[order], turned_deg), size, stamps[order], found)
 
 
 def _add_imu(path: Path, found: _FolderStreams) -> None:
-    found.imus[path.stem], findings = read_imu_csv(path, path.stem)
+    name = _free_name(path, found.imus, found)
+    found.imus[name], findings = read_imu_csv(path, name)
     found.findings += findings
 
 
 def _add_gnss(path: Path, found: _FolderStreams) -> None:
-    found.gnss[path.stem], findings = read_gnss_csv(path, path.stem)
+    name = _free_name(path, found.gnss, found)
+    found.gnss[name], findings = read_gnss_csv(path, name)
     found.findings += findings
 
 
 def _add_attitude(path: Path, found: _FolderStreams) -> None:
-    found.attitudes[path.stem], findings = read_attitude_csv(path, path.stem)
+    name = _free_name(path, found.attitudes, found)
+    found.attitudes[name], findings = read_attitude_csv(path, name)
     found.findings += findings
 
 
@@ -204,8 +266,11 @@ _ADD_TABLE: dict[str, Callable[[Path, _FolderStreams], None]] = {
 
 
 def _add_nmea(path: Path, found: _FolderStreams) -> None:
-    found.gnss[path.stem], attitude, findings = read_nmea(path, path.stem)
+    name = _free_name(path, found.gnss, found)
+    found.gnss[name], attitude, findings = read_nmea(path, name)
     if attitude is not None:
+        taken = attitude.name in found.attitudes
+        attitude = replace(attitude, name=f"{attitude.name}_{name}") if taken else attitude
         found.attitudes[attitude.name] = attitude
     found.findings += findings
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rigwake._types import Image
 from rigwake.errors import InputError
+from rigwake.readers.jpeg_fill import is_filled_up
 
 MAX_PIXELS = 2**27
 """134 megapixels: above any machine-vision sensor, below what endangers memory."""
@@ -96,6 +97,8 @@ def decode_compressed(encoded: bytes, *, colour: bool) -> Image:
         raise InputError("A compressed image cannot be decoded.") from error
     if image is None:
         raise InputError("A compressed image cannot be decoded.")
+    if is_filled_up(encoded, image):
+        raise InputError("A compressed image is cut off, although it has an end marker.")
     return image
 
 

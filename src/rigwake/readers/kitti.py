@@ -15,13 +15,14 @@ from rigwake.errors import CameraError, InputError
 from rigwake.geometry import so3
 from rigwake.geometry.geodesy import enu_from_lla
 from rigwake.geometry.se3 import SE3
-from rigwake.readers.csv_tables import stamps_from_text
 from rigwake.readers.image_files import FileFrames, first_file_size, image_files
 from rigwake.readers.rig_file import rigid_transform
+from rigwake.readers.stamp_units import stamps_from_text
 from rigwake.readers.streams import time_order, usable_rows
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.recording import AttitudeStream, CameraStream, Finding, GnssStream, ImuStream, Recording
 from rigwake.rig import Rig, RigCamera
+from rigwake.text_files import read_text_file
 from rigwake.trajectory import Trajectory
 
 _NOMINAL_PERIOD_NS = 100_000_000
@@ -93,12 +94,7 @@ def _truth(path: Path, findings: list[Finding]) -> dict[str, Trajectory]:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        if path.stat().st_size > _MAX_TEXT_BYTES:
-            raise InputError(f"{path} is too large.")
-        return path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}).") from error
+    return read_text_file(path, _MAX_TEXT_BYTES).splitlines()
 
 
 def _matrices(path: Path, findings: list[Finding]) -> dict[str, Array]:
@@ -243,9 +239,10 @@ def _oxts(folder: Path, findings: list[Finding]) -> tuple[ImuStream, GnssStream,
 
 def _oxts_values(file: Path) -> Sequence[float]:
     try:
-        return [float(cell) for cell in _lines(file)[0].split()[:_OXTS_VALUES]]
+        values = [float(cell) for cell in _lines(file)[0].split()[:_OXTS_VALUES]]
     except (ValueError, IndexError, InputError):
-        return [float("nan")] * _OXTS_VALUES
+        values = []
+    return values if len(values) == _OXTS_VALUES else [float("nan")] * _OXTS_VALUES
 
 
 def _oxts_attitude(values: Array) -> tuple[Array, Array]:

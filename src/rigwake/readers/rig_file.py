@@ -6,29 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from rigwake.cameras.protocol import CameraModel
 from rigwake.cameras.registry import camera_from_dict
 from rigwake.errors import CameraError, InputError
 from rigwake.geometry.se3 import SE3
 from rigwake.rig import Rig, RigCamera
-
-_MAX_BYTES = 2**22
-
-
-def read_yaml_mapping(path: Path) -> dict[str, Any]:
-    """A YAML file that holds a mapping; the `%YAML:1.0` line of OpenCV is accepted. InputError otherwise."""
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise InputError(f"{path} is too large for a settings file.")
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-        content = yaml.safe_load("\n".join(line for line in lines if not line.startswith("%")))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as YAML ({error}).") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{path} does not hold named settings.")
-    return content
+from rigwake.yaml_input import read_yaml_settings
 
 
 def rigid_transform(matrix: Any, where: str) -> SE3:
@@ -49,10 +33,11 @@ def read_rig_file(path: Path) -> tuple[dict[str, CameraModel], Rig | None]:
     Keys: `reference`, `cameras.NAME.camera` (a lens), `cameras.NAME.rig_from_cam` (`quat_wxyz`,
     `translation_m`), `cameras.NAME.time_offset_s`, `antenna_rig_m`, `rig_from_imu`. Raises InputError.
     """
-    content = read_yaml_mapping(path)
+    content = read_yaml_settings(path)
     try:
         described = {str(name): dict(entry or {}) for name, entry in dict(content["cameras"]).items()}
-        models = {n: camera_from_dict(e["camera"]) for n, e in described.items() if e.get("camera")}
+        lenses = {n: e if "params" in e else e.get("camera") for n, e in described.items()}
+        models = {n: camera_from_dict(lens) for n, lens in lenses.items() if lens}
         if not described or not all("rig_from_cam" in entry for entry in described.values()):
             return models, None
         cameras = {

@@ -10,7 +10,6 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
-import yaml
 import zstandard
 
 from rigwake._types import Stamps
@@ -18,6 +17,7 @@ from rigwake.errors import InputError
 from rigwake.readers.channels import MAX_MESSAGE_BYTES, BagIndex, Channel, joined, standard_type_name
 from rigwake.readers.mcap_file import index_mcap
 from rigwake.recording import Finding
+from rigwake.yaml_input import read_yaml
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 METADATA = "metadata.yaml"
@@ -134,10 +134,8 @@ def index_rosbag2_folder(folder: Path) -> BagIndex:
 
 def _metadata(path: Path) -> dict[str, object]:
     try:
-        if path.stat().st_size > _MAX_METADATA_BYTES:
-            raise InputError(f"{path} is too large for a metadata file.")
-        information = yaml.safe_load(path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
+        information = read_yaml(path, _MAX_METADATA_BYTES)["rosbag2_bagfile_information"]
+    except (InputError, KeyError, TypeError) as error:
         raise InputError(
             f"{path} cannot be read as the metadata of a ROS 2 bag ({error}).",
             remedy="`ros2 bag reindex` writes a new one; or open the .db3 or .mcap file itself.",

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
-import yaml
-
 from rigwake.errors import InputError, UsageError
+from rigwake.yaml_input import read_yaml
 
 ROLES = ("camera", "imu", "gnss", "pose")
 
@@ -61,9 +60,11 @@ _EXAMPLE = "Write camera.front=/a/b, imu=/x, gnss=/y, or pose.base=/z."
 
 def _flat_mapping(file: Path) -> Iterable[tuple[str, str]]:
     try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"The topic mapping {file} cannot be read: {error}.", remedy=_EXAMPLE) from error
+        content = read_yaml(file)
+    except InputError as error:
+        raise InputError(
+            f"The topic mapping {file} cannot be read: {error.cause}", remedy=_EXAMPLE
+        ) from error
     if not isinstance(content, dict):
         raise InputError(f"The topic mapping {file} is not a YAML mapping.", remedy=_EXAMPLE)
     for key, value in content.items():

@@ -1,14 +1,14 @@
-"""Trajectory files: TUM, KITTI, EuRoC/ASL and csv with a header, sniffed from their content.
+"""Trajectory files of any odometry: TUM, KITTI, EuRoC/ASL, csv with names, matrices; told apart by their content.
 
-| format | a row | time |
-|---|---|---|
-| TUM | `t x y z qx qy qz qw`, spaces or commas | seconds |
-| KITTI | the 12 entries of `world_from_body`, row by row | from a times file, else nominal |
-| EuRoC | `t_ns, x, y, z, qw, qx, qy, qz, ...` | nanoseconds |
-| csv | any order, named in a header line: `timestamp_ns`/`t`, `x y z`, `qw qx qy qz` | by name or size |
+| a row | time |
+|---|---|
+| `t x y z qx qy qz qw` and more (TUM, ORB-SLAM, OpenVINS, evo) | unit by its size, or as the header says |
+| `t_ns,x,y,z,qw,qx,qy,qz` and more (EuRoC, VINS) | the same |
+| 12 or 16 entries of a matrix, also behind a stamp or a frame number (KITTI, KITTI-360) | `times.txt`, else nominal |
+| any order, named in a header line or a comment (rostopic echo -p, PlotJuggler, OKVIS) | by name or size |
 
-A file `NAME.cov.csv` beside `NAME.tum` holds covariances (see `writers.trajectories`) and is read with it.
-What can be repaired is repaired and reported as findings; what cannot raises TrajectoryError with the line.
+`trajectory_columns` says which column is which. A file `NAME.cov.csv` beside `NAME.tum` holds covariances and is read
+with it. What can be repaired is repaired and reported as findings; what cannot raises TrajectoryError with the line.
 """
 
 from __future__ import annotations
@@ -17,24 +17,32 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rigwake._types import Array, Stamps
-from rigwake.errors import InputError, TrajectoryError
+from rigwake.errors import TrajectoryError
+from rigwake.geometry.euler import rotation_from_yaw_pitch_roll
 from rigwake.geometry.se3 import SE3
 from rigwake.geometry.so3 import nearest_rotation
-from rigwake.recording import Finding
-from rigwake.trajectory import CovarianceKind, Trajectory
-
-TrajectoryFormat = Literal["tum", "kitti", "euroc", "csv"]
-_NOMINAL_RATE_HZ = 10  # of KITTI files without times
-_NANOSECONDS_FROM = (
-    1e14  # a stamp this large cannot be seconds (year 3 million), but 1970-01-02 in nanoseconds
+from rigwake.readers.held_positions import without_held_positions
+from rigwake.readers.quaternion_order import steadier_order
+from rigwake.readers.stamp_units import NS_PER_UNIT, decimal_or_none, unit_of_cells
+from rigwake.readers.trajectory_columns import (
+    COLUMNS_REMEDY,
+    PoseColumns,
+    TrajectoryFormat,
+    choose_columns,
 )
+from rigwake.readers.trajectory_frames import in_house_frames
+from rigwake.readers.trajectory_rows import TextRow, TextRows, is_number, read_text_rows
+from rigwake.readers.trajectory_sidecar import read_sidecar
+from rigwake.recording import Finding
+from rigwake.trajectory import Trajectory
+
+_NOMINAL_RATE_HZ = 10  # of files without times
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,183 +54,130 @@ class TrajectoryFile:
     findings: tuple[Finding, ...] = ()
 
 
-@dataclass(frozen=True)
-class _Row:
-    line: int
-    cells: tuple[str, ...]
-
-
 def read_trajectory(
     path: Path | str,
     *,
     name: str | None = None,
     file_format: TrajectoryFormat | None = None,
     times: Path | str | None = None,
+    columns: str | None = None,
+    frame: str = "enu",
 ) -> TrajectoryFile:
     """Read one trajectory file.
 
-    name: of the body; default the file's stem. file_format: default sniffed. times: stamps of a KITTI file,
-    one in seconds per line; default `times.txt` beside it. Raises TrajectoryError naming file and line.
+    name: of the body; default the file's stem. file_format: default by content. times: stamps of a file without any,
+    one in seconds per line; default `times.txt` beside it. columns: names of the columns, `t x y z qw qx qy qz`, `_`
+    for those of no use. frame: what the rows mean, see `trajectory_frames`. Raises TrajectoryError with file and line.
     """
     path = Path(path)
-    rows, comments = _rows(path)
-    chosen = file_format or _sniff(path, rows, comments)
+    text = read_text_rows(path)
+    if not text.rows:
+        raise TrajectoryError(f"{path} holds a header but no poses.", remedy=COLUMNS_REMEDY)
+    chosen = choose_columns(text, columns, file_format)
     name = name or path.name.split(".")[0]
     findings: list[Finding] = []
-    if chosen == "kitti":
-        stamps, transforms = _read_kitti(path, rows, times, name, findings)
-    else:
-        stamps, transforms = _read_stamped(path, rows, _columns(path, chosen, rows, comments), name, findings)
-    kept = _order(stamps, name, findings)
-    stamps, transforms = stamps[kept], transforms[kept]
+    kept, values, unusable = _pose_values(path, text.rows, chosen)
+    stamps, unit_findings = _stamps(text, chosen, kept, times, name)
+    if not chosen.named and len(chosen.rotation) == 4 and len(values) > 2:
+        chosen, values, order_finding = steadier_order(chosen, values, name)
+        findings += order_finding
+    findings += [*unit_findings, *_said(unusable, len(kept), stamps, name)]
+    transforms, repaired = _transforms(path, [text.rows[i] for i in kept], values, chosen, name)
+    findings += repaired
+    order, sorted_findings = _order(stamps, name)
+    stamps, transforms = stamps[order], transforms[order]
     if len(stamps) < 2:
+        most = f" {len(unusable)} of {len(text.rows)} rows, most rows, hold NaN or infinite values or zeros."
         raise TrajectoryError(
-            f"{path}: {len(stamps)} usable pose(s); a trajectory needs at least two.",
+            f"{path}: {len(stamps)} usable pose(s); a trajectory needs at least two.{most if unusable else ''}",
             remedy="Check that the recording is complete.",
         )
-    is_metric = not any(re.search(r"is_metric:\s*false", comment) for comment in comments)
-    covariances, kind, segments = _read_sidecar(path.with_suffix(".cov.csv"), stamps, findings, name)
-    trajectory = Trajectory(name, stamps, transforms, covariances, kind, is_metric, segments)
-    return TrajectoryFile(trajectory, chosen, tuple(findings))
-
-
-def _rows(path: Path) -> tuple[list[_Row], list[str]]:
-    """Rows of cells with their line numbers, and the comment lines."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise InputError(f"There is no file {path}.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise TrajectoryError(f"{path} is not a readable text file: {error}.") from error
-    rows, comments = [], []
-    for number, line in enumerate(text.splitlines(), start=1):
-        stripped = line.strip()
-        if stripped.startswith(("#", "%")):
-            comments.append(stripped.lstrip("#% "))
-        elif stripped:
-            separator = ";" if ";" in stripped else "," if "," in stripped else None
-            rows.append(_Row(number, tuple(cell.strip() for cell in stripped.split(separator))))
-    if not rows:
-        raise TrajectoryError(f"{path} holds no poses.", remedy="Check that the recording is complete.")
-    return rows, comments
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _sniff(path: Path, rows: Sequence[_Row], comments: Sequence[str]) -> TrajectoryFormat:
-    first = rows[0].cells
-    if not all(_is_number(cell) for cell in first):
-        return "csv"
-    if len(first) == 12:
-        return "kitti"
-    is_ns = "." not in first[0] and math.isfinite(float(first[0])) and float(first[0]) > _NANOSECONDS_FROM
-    if len(first) >= 8 and is_ns:
-        return "euroc"
-    if len(first) == 8:
-        return "tum"
-    raise TrajectoryError(
-        f"{path}, line {rows[0].line}: {len(first)} columns fit no known trajectory format.",
-        remedy="TUM has 8 columns, KITTI 12, EuRoC at least 8 with stamps in ns; or give a header line.",
+    is_metric = not any(re.search(r"is_metric:\s*false", comment) for comment in text.comments)
+    sidecar, sidecar_findings = read_sidecar(path.with_suffix(".cov.csv"), stamps, name)
+    trajectory = in_house_frames(
+        Trajectory(
+            name, stamps, transforms, sidecar.covariances, sidecar.kind, is_metric, sidecar.segment_ids
+        ),
+        frame,
+    )
+    trajectory, held = without_held_positions(trajectory)
+    return TrajectoryFile(
+        trajectory, chosen.file_format, (*findings, *sorted_findings, *sidecar_findings, *held)
     )
 
 
-@dataclass(frozen=True)
-class _Columns:
-    """Where to find what: indices of stamp, x y z and qw qx qy qz, the row's width, the unit of time."""
-
-    stamp: int
-    position: tuple[int, int, int]
-    quat_wxyz: tuple[int, int, int, int]
-    width: int | None
-    stamp_unit: Literal["s", "ns"]
-    skip_rows: int = 0
-
-
-def _columns(path: Path, chosen: str, rows: Sequence[_Row], comments: Sequence[str]) -> _Columns:
-    if chosen == "tum":
-        return _Columns(0, (1, 2, 3), (7, 4, 5, 6), 8, "s")
-    if chosen == "euroc":
-        return _Columns(0, (1, 2, 3), (4, 5, 6, 7), len(rows[0].cells), "ns")
-    return _columns_from_header(path, rows)
-
-
-_NAMES: dict[str, str] = {
-    "stamp": r"(t|time|timestamp|stamp|secs?|seconds|header\.stamp)(_?(s|ns|nsec)|\s*[\[(](s|ns|nsec)[\])])?",
-    "x": r"(x|tx|px|p_?x|pos_?x|position_?\.?x|.*position\.x|p_rs_r_x.*)(_m|\s*[\[(]m[\])])?",
-    "y": r"(y|ty|py|p_?y|pos_?y|position_?\.?y|.*position\.y|p_rs_r_y.*)(_m|\s*[\[(]m[\])])?",
-    "z": r"(z|tz|pz|p_?z|pos_?z|position_?\.?z|.*position\.z|p_rs_r_z.*)(_m|\s*[\[(]m[\])])?",
-    "qw": r"(qw|q_?w|quat_?w|.*orientation\.w|orientation_?w|q_rs_w.*)",
-    "qx": r"(qx|q_?x|quat_?x|.*orientation\.x|orientation_?x|q_rs_x.*)",
-    "qy": r"(qy|q_?y|quat_?y|.*orientation\.y|orientation_?y|q_rs_y.*)",
-    "qz": r"(qz|q_?z|quat_?z|.*orientation\.z|orientation_?z|q_rs_z.*)",
-}
-
-
-def _columns_from_header(path: Path, rows: Sequence[_Row]) -> _Columns:
-    header = [cell.lower().strip("\"'") for cell in rows[0].cells]
-    found: dict[str, int] = {}
-    for wanted, pattern in _NAMES.items():
-        matches = [i for i, cell in enumerate(header) if re.fullmatch(pattern, cell)]
-        if len(matches) != 1:
-            raise TrajectoryError(
-                f"{path}, line {rows[0].line}: the header names {len(matches)} columns for {wanted}: "
-                f"{', '.join(rows[0].cells)}.",
-                remedy="Name the columns timestamp_ns (or t), x, y, z, qw, qx, qy, qz.",
-            )
-        found[wanted] = matches[0]
-    if len(rows) < 2:
-        raise TrajectoryError(f"{path} holds a header but no poses.")
-    named_ns = re.search(r"ns", header[found["stamp"]]) is not None
-    first = rows[1].cells[found["stamp"]] if found["stamp"] < len(rows[1].cells) else ""
-    large = _is_number(first) and float(first) > _NANOSECONDS_FROM
-    return _Columns(
-        found["stamp"],
-        (found["x"], found["y"], found["z"]),
-        (found["qw"], found["qx"], found["qy"], found["qz"]),
-        len(header),
-        "ns" if named_ns or large else "s",
-        skip_rows=1,
-    )
-
-
-def _stamp_ns(cell: str, unit: Literal["s", "ns"]) -> int:
-    """Exact nanoseconds; seconds are read as decimals, for a float keeps only 240 ns of a date."""
-    value = Decimal(cell)
-    return int((value * 10**9 if unit == "s" else value).to_integral_value())
-
-
-def _read_stamped(
-    path: Path, rows: Sequence[_Row], columns: _Columns, name: str, findings: list[Finding]
-) -> tuple[Stamps, SE3]:
-    indices = (*columns.position, *columns.quat_wxyz)
-    stamps: list[int] = []
+def _pose_values(
+    path: Path, rows: Sequence[TextRow], chosen: PoseColumns
+) -> tuple[list[int], Array, list[int]]:
+    """Rows that hold a pose, their numbers (position, rotation), and the lines of those that do not: NaN, or an
+    orientation of zeros, as trackers write before they begin."""
+    width = len(rows[0].cells)
+    kept: list[int] = []
     values: list[list[float]] = []
-    bad_lines: list[int] = []
-    for row in rows[columns.skip_rows :]:
-        if len(row.cells) != columns.width:
+    unusable: list[int] = []
+    columns, turn = chosen.used, len(chosen.position)
+    for at, row in enumerate(rows):
+        if len(row.cells) != width:
+            expected = (
+                "where KITTI has 12" if chosen.file_format == "kitti" else f"where {width} are expected"
+            )
             raise TrajectoryError(
-                f"{path}, line {row.line}: {len(row.cells)} columns where {columns.width} are expected.",
+                f"{path}, line {row.line}: {len(row.cells)} columns {expected}.",
                 remedy="A last line cut short means an unfinished file: remove it if the rest is right.",
             )
         try:
-            numbers = [float(row.cells[i]) for i in indices]
-            if all(map(math.isfinite, numbers)) and math.isfinite(float(row.cells[columns.stamp])):
-                stamps.append(_stamp_ns(row.cells[columns.stamp], columns.stamp_unit))
-                values.append(numbers)
-            else:
-                bad_lines.append(row.line)
-        except (ValueError, InvalidOperation, OverflowError) as error:
+            numbers = [float(row.cells[i]) for i in columns]
+            stamped = all(math.isfinite(float(row.cells[i])) for i in chosen.stamp)
+        except ValueError as error:
             raise TrajectoryError(f"{path}, line {row.line}: not a number in {row.cells}.") from error
-    _report_bad_lines(path, bad_lines, len(values), name, findings)
-    numbers_array = np.array(values).reshape(-1, 7)
-    _check_quaternions(path, rows[columns.skip_rows :], numbers_array[:, 3:], name, findings)
-    return _stamp_array(path, stamps), SE3.from_quat_wxyz(numbers_array[:, 3:], numbers_array[:, :3])
+        is_zero = len(chosen.rotation) > 3 and not any(numbers[turn:])
+        if stamped and not is_zero and all(map(math.isfinite, numbers)):
+            kept.append(at)
+            values.append(numbers)
+        else:
+            unusable.append(row.line)
+    return kept, np.array(values).reshape(-1, len(columns)), unusable
+
+
+def _said(unusable: list[int], good: int, stamps: Stamps, name: str) -> list[Finding]:
+    """A finding for rows that were left out, with the longest gap they leave if they are many."""
+    if not unusable:
+        return []
+    listed = ", ".join(map(str, unusable[:5])) + (", ..." if len(unusable) > 5 else "")
+    message = (
+        f"{len(unusable)} rows with NaN, infinite values or zeros for an orientation left out, lines {listed}"
+    )
+    if len(unusable) > good and len(stamps) > 1:
+        gap_s = float(np.max(np.diff(np.sort(stamps)))) * 1e-9
+        message += f": most of the file; the longest gap is {gap_s:.3g} s"
+    return [Finding("warning", name, message)]
+
+
+def _stamps(
+    text: TextRows, chosen: PoseColumns, kept: list[int], times: Path | str | None, name: str
+) -> tuple[Stamps, list[Finding]]:
+    """Stamps of the rows that are kept."""
+    if not chosen.stamp or chosen.is_index or times is not None:
+        indices = list(range(len(text.rows)))
+        if chosen.is_index:
+            indices = [int(float(row.cells[chosen.stamp[0]])) for row in text.rows]
+        return _listed_stamps(text, indices, kept, times, name)
+    cells = [[decimal_or_none(text.rows[at].cells[i]) for at in kept] for i in chosen.stamp]
+    if any(value is None for column in cells for value in column):
+        raise TrajectoryError(f"{text.path}: a stamp does not fit into 64 bits of nanoseconds.")
+    first = [value for value in cells[0] if value is not None]
+    if len(chosen.stamp) == 2:
+        nano = [value for value in cells[1] if value is not None]
+        exact = [round(s * 10**9 + n) for s, n in zip(first, nano, strict=True)]
+        return _stamp_array(text.path, exact), []
+    findings = []
+    unit = chosen.stamp_unit or unit_of_cells(first)
+    if chosen.stamp_unit and first and max(map(abs, first)) * NS_PER_UNIT[unit] >= 2**63:
+        by_size = unit_of_cells(first)
+        message = f"the header says {unit}, but the stamps have the size of {by_size}: read as {by_size}"
+        findings.append(Finding("warning", name, message))
+        unit = by_size
+    return _stamp_array(text.path, [round(value * NS_PER_UNIT[unit]) for value in first]), findings
 
 
 def _stamp_array(path: Path, stamps: list[int]) -> Stamps:
@@ -231,28 +186,72 @@ def _stamp_array(path: Path, stamps: list[int]) -> Stamps:
     return np.array(stamps, dtype=np.int64)
 
 
-def _report_bad_lines(
-    path: Path, bad_lines: list[int], good: int, name: str, findings: list[Finding]
-) -> None:
-    if not bad_lines:
-        return
-    listed = ", ".join(map(str, bad_lines[:5])) + (", ..." if len(bad_lines) > 5 else "")
-    if len(bad_lines) > good:
+def _listed_stamps(
+    text: TextRows, indices: list[int], kept: list[int], times: Path | str | None, name: str
+) -> tuple[Stamps, list[Finding]]:
+    """Stamps of `times.txt`, by row or by frame number; without one at a nominal rate."""
+    path = text.path
+    times_path = Path(times) if times is not None else path.with_name("times.txt")
+    if times is None and not times_path.is_file():
+        message = f"no times.txt beside {path.name}: nominal {_NOMINAL_RATE_HZ} Hz assumed"
+        period = 10**9 // _NOMINAL_RATE_HZ
+        return _stamp_array(path, [indices[at] * period for at in kept]), [Finding("warning", name, message)]
+    cells = [row.cells[0] for row in read_text_rows(times_path).rows]
+    by_row = indices == list(range(len(indices)))
+    if len(cells) != len(indices) and (by_row or max(indices, default=0) >= len(cells)):
+        raise TrajectoryError(f"{times_path} holds {len(cells)} stamps, {path} {len(indices)} poses.")
+    if not all(is_number(cell) for cell in cells):
+        raise TrajectoryError(f"{times_path}: not a number: {next(c for c in cells if not is_number(c))}.")
+    values = [decimal_or_none(cell) for cell in cells]
+    unit = unit_of_cells(values)
+    chosen = [values[indices[at]] for at in kept]
+    if any(value is None for value in chosen):
+        raise TrajectoryError(f"{times_path}: a stamp does not fit into 64 bits of nanoseconds.")
+    exact = [round(value * NS_PER_UNIT[unit]) for value in chosen if value is not None]
+    return _stamp_array(times_path, exact), []
+
+
+def _transforms(
+    path: Path, rows: Sequence[TextRow], values: Array, chosen: PoseColumns, name: str
+) -> tuple[SE3, list[Finding]]:
+    """Poses of the numbers, and a finding for what was made orthonormal."""
+    position, turn = chosen.metres * values[:, :3], values[:, 3:]
+    if len(chosen.rotation) == 4:
+        findings = _check_quaternions(path, rows, turn, name)
+        return SE3.from_quat_wxyz(turn, position), findings
+    if len(chosen.rotation) == 3:
+        return SE3(_rotation_of_angles(path, turn, chosen.radians), position), []
+    matrices = turn.reshape(-1, 3, 3)
+    rotations = nearest_rotation(matrices) if len(matrices) else matrices
+    deviation = np.abs(rotations - matrices).max(axis=(1, 2), initial=0)
+    if deviation.max(initial=0) > 0.1:
+        at = int(deviation.argmax())
+        mirrored = np.linalg.det(matrices[at]) < 0
         raise TrajectoryError(
-            f"{path}: most rows ({len(bad_lines)} of {len(bad_lines) + good}) hold NaN or infinite values, "
-            f"lines {listed}.",
-            remedy="The program that wrote them lost track: record or estimate again.",
+            f"{path}, line {rows[at].line}: the 3 x 3 block is not a rotation"
+            + (", it is mirrored." if mirrored else "."),
+            remedy="One of its frames is left-handed: write it with right-handed axes." if mirrored else "",
         )
-    findings.append(
-        Finding(
-            "warning", name, f"{len(bad_lines)} rows with NaN or infinite values left out, lines {listed}"
-        )
-    )
+    if deviation.max(initial=0) > 1e-3:
+        return SE3(rotations, position), [
+            Finding("warning", name, "rotations off orthonormal by over 0.1 % projected back")
+        ]
+    return SE3(rotations, position), []
 
 
-def _check_quaternions(
-    path: Path, rows: Sequence[_Row], quat_wxyz: Array, name: str, findings: list[Finding]
-) -> None:
+def _rotation_of_angles(path: Path, angles: Array, radians: float | None) -> Array:
+    """`Rz(yaw) Ry(pitch) Rx(roll)`; TrajectoryError where neither name nor size tells the unit."""
+    if radians is None:
+        if np.abs(angles).max(initial=0) <= 2 * np.pi:
+            raise TrajectoryError(
+                f"{path}: roll, pitch and yaw could be radians or degrees.",
+                remedy="Name the columns roll_deg (or roll_rad) and so on, in the header or with --columns.",
+            )
+        radians = np.pi / 180
+    return np.stack([rotation_from_yaw_pitch_roll(angle) for angle in radians * angles[:, ::-1]])
+
+
+def _check_quaternions(path: Path, rows: Sequence[TextRow], quat_wxyz: Array, name: str) -> list[Finding]:
     norms = np.linalg.norm(quat_wxyz, axis=1)
     wrong = np.flatnonzero(np.abs(norms - 1) > 0.1)
     if len(wrong):
@@ -260,97 +259,24 @@ def _check_quaternions(
         raise TrajectoryError(
             f"{path}, near line {line}: a quaternion of norm {norms[wrong[0]]:.3g}, not 1 "
             f"({len(wrong)} such rows).",
-            remedy="Check the order of the columns.",
+            remedy="Check the order of the columns: name them in a header line or with --columns.",
         )
     off = int(np.sum(np.abs(norms - 1) > 1e-3))
-    if off:
-        findings.append(Finding("warning", name, f"{off} quaternions off unit norm by over 0.1 % normalised"))
+    return (
+        [Finding("warning", name, f"{off} quaternions off unit norm by over 0.1 % normalised")] if off else []
+    )
 
 
-def _read_kitti(
-    path: Path, rows: Sequence[_Row], times: Path | str | None, name: str, findings: list[Finding]
-) -> tuple[Stamps, SE3]:
-    values = np.empty((len(rows), 12))
-    for i, row in enumerate(rows):
-        if len(row.cells) != 12:
-            raise TrajectoryError(f"{path}, line {row.line}: {len(row.cells)} columns where KITTI has 12.")
-        try:
-            values[i] = [float(cell) for cell in row.cells]
-        except ValueError as error:
-            raise TrajectoryError(f"{path}, line {row.line}: not a number.") from error
-    stamps = _kitti_stamps(path, len(rows), times, name, findings)
-    finite = np.isfinite(values).all(axis=1)
-    bad_lines = [rows[i].line for i in np.flatnonzero(~finite).tolist()]
-    _report_bad_lines(path, bad_lines, int(finite.sum()), name, findings)
-    matrices = values[finite].reshape(-1, 3, 4)
-    rotations = nearest_rotation(matrices[:, :, :3])
-    deviation = np.abs(rotations - matrices[:, :, :3]).max(axis=(1, 2))
-    if deviation.max(initial=0) > 0.1:
-        line = rows[int(np.flatnonzero(finite)[deviation.argmax()])].line
-        raise TrajectoryError(f"{path}, line {line}: the 3 x 3 block is not a rotation.")
-    if deviation.max(initial=0) > 1e-3:
-        findings.append(Finding("warning", name, "rotations off orthonormal by over 0.1 % projected back"))
-    return stamps[finite], SE3(rotations, matrices[:, :, 3])
-
-
-def _kitti_stamps(
-    path: Path, count: int, times: Path | str | None, name: str, findings: list[Finding]
-) -> Stamps:
-    times_path = Path(times) if times is not None else path.with_name("times.txt")
-    if times is None and not times_path.is_file():
-        findings.append(
-            Finding(
-                "warning", name, f"no times.txt beside {path.name}: nominal {_NOMINAL_RATE_HZ} Hz assumed"
-            )
-        )
-        return np.arange(count, dtype=np.int64) * (10**9 // _NOMINAL_RATE_HZ)
-    rows, _ = _rows(times_path)
-    if len(rows) != count:
-        raise TrajectoryError(f"{times_path} holds {len(rows)} stamps, {path} {count} poses.")
-    try:
-        return _stamp_array(times_path, [_stamp_ns(row.cells[0], "s") for row in rows])
-    except (ValueError, InvalidOperation, OverflowError) as error:
-        raise TrajectoryError(f"{times_path}: not a number: {error}.") from error
-
-
-def _order(stamps: Stamps, name: str, findings: list[Finding]) -> Stamps:
-    """Indices in the order of time, each stamp once."""
+def _order(stamps: Stamps, name: str) -> tuple[NDArray[np.int64], list[Finding]]:
+    """Indices in the order of time, each stamp once, and what that changed."""
+    findings = []
     order = np.argsort(stamps, kind="stable")
     backwards = int(np.sum(np.diff(stamps) < 0))
     if backwards:
         findings.append(Finding("warning", name, f"stamps went back {backwards} times: sorted"))
     repeated = np.flatnonzero(np.diff(stamps[order]) == 0) + 1
     if len(repeated):
-        findings.append(Finding("warning", name, f"{len(repeated)} duplicate stamps: the first of each kept"))
-    return np.delete(order, repeated)
-
-
-def _read_sidecar(
-    path: Path, stamps: Stamps, findings: list[Finding], name: str
-) -> tuple[Array | None, CovarianceKind, Stamps | None]:
-    """Covariances and segments of `NAME.cov.csv`, matched by stamp; none if the file is not there."""
-    if not path.is_file():
-        return None, "increments", None
-    rows, comments = _rows(path)
-    kind: CovarianceKind = "poses" if any("covariances of poses" in c for c in comments) else "increments"
-    width = len(rows[0].cells)
-    table: dict[int, list[float]] = {}
-    for row in rows:
-        try:
-            if len(row.cells) != width or width not in (2, 23):
-                raise ValueError(f"{len(row.cells)} columns where 2 or 23 are expected")
-            table[int(row.cells[0])] = [float(cell) for cell in row.cells[1:]]
-        except ValueError as error:
-            raise TrajectoryError(f"{path}, line {row.line}: {error}.") from error
-    missing = sum(stamp not in table for stamp in stamps.tolist())
-    if missing:
-        findings.append(Finding("warning", name, f"{path.name} ignored: it lacks {missing} of the stamps"))
-        return None, "increments", None
-    values = np.array([table[stamp] for stamp in stamps.tolist()])
-    segments = values[:, 0].astype(np.int64)
-    if width == 2:
-        return None, "increments", segments
-    upper = np.triu_indices(6)
-    covariances = np.zeros((len(stamps), 6, 6))
-    covariances[:, upper[0], upper[1]] = covariances[:, upper[1], upper[0]] = values[:, 1:]
-    return covariances, kind, segments
+        many = ": written with too few digits?" if len(repeated) > len(stamps) // 3 else ""
+        message = f"{len(repeated)} duplicate stamps: the first of each kept{many}"
+        findings.append(Finding("warning", name, message))
+    return np.delete(order, repeated), findings

@@ -11,33 +11,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from rigwake.calibration.yaml_file import calibration_from_dict
 from rigwake.errors import InputError
 from rigwake.geometry.se3 import SE3
 from rigwake.rig import Rig, RigCamera
+from rigwake.yaml_input import read_yaml_settings
 
 BASE = "base_link"
-
-
-def read_yaml_mapping(path: Path) -> Mapping[str, Any]:
-    """The top-level mapping of a YAML file, read without constructing objects; InputError otherwise."""
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.CSafeLoader)
-    except FileNotFoundError as error:
-        raise InputError(f"There is no file {path}.") from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{path} cannot be read as YAML: {error}.") from error
-    if not isinstance(content, Mapping):
-        raise InputError(f"{path} holds no mapping at its top level.")
-    return content
+_UNIT = 1e-2
 
 
 def read_true_rig(path: Path | str) -> Rig:
     """The rig of a `truth.yaml` (frame `base_link`) or of a calibration file (its own reference)."""
     path = Path(path)
-    content = read_yaml_mapping(path)
+    content = read_yaml_settings(path)
     if "rigwake_calibration" in content:
         return calibration_from_dict(content, str(path)).rig
     try:
@@ -72,8 +60,10 @@ def _rig_of_truth(content: Mapping[str, Any]) -> Rig:
 def _transform(content: Mapping[str, Any]) -> SE3:
     quat_wxyz = np.array(content["quat_wxyz"], dtype=np.float64)
     translation = np.array(content["translation_m"], dtype=np.float64)
-    if quat_wxyz.shape != (4,) or translation.shape != (3,):
-        raise ValueError("a transform wants quat_wxyz (4) and translation_m (3)")
+    if quat_wxyz.shape != (4,) or translation.shape != (3,) or not np.isfinite(translation).all():
+        raise ValueError("a transform wants quat_wxyz (4) and translation_m (3), finite")
+    if not abs(np.linalg.norm(quat_wxyz) - 1) < _UNIT:
+        raise ValueError(f"quat_wxyz {quat_wxyz.tolist()} is not of norm 1")
     return SE3.from_quat_wxyz(quat_wxyz, translation)
 
 

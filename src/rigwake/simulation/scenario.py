@@ -10,10 +10,11 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from rigwake.errors import UsageError
+from rigwake.errors import InputError, UsageError
+from rigwake.text_files import read_text_file
+from rigwake.yaml_input import parse_yaml
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -270,7 +271,7 @@ def load_scenario(source: str | Path) -> Scenario:
             f"No scenario {text!r}: neither a file nor a preset.",
             remedy=f"Presets: {', '.join(preset_names())}.",
         )
-    return parse_scenario(path.read_text(encoding="utf-8"), path.name)
+    return parse_scenario(read_text_file(path), path.name)
 
 
 def parse_scenario(text: str, origin: str = "scenario") -> Scenario:
@@ -287,9 +288,9 @@ def _preset_text(name: str) -> str:
 
 def _document(text: str, origin: str) -> Any:
     try:
-        document = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise UsageError(f"{origin} is not YAML: {error}") from error
+        document = parse_yaml(text, origin)
+    except InputError as error:
+        raise UsageError(f"{origin} is not YAML: {error.cause}") from error
     if not isinstance(document, dict) or "base" not in document:
         return document
     base = document.pop("base")

@@ -24,11 +24,13 @@ from rigwake.cameras.formats.opencv_yaml import (
     camera_from_opencv,
     camera_to_camodocal,
     camera_to_opencv,
-    load_yaml,
 )
 from rigwake.cameras.protocol import CameraModel
 from rigwake.cameras.registry import camera_from_dict, camera_to_dict
+from rigwake.cameras.slam_lenses import cameras_from_orbslam, is_orbslam
 from rigwake.errors import CameraError, InputError, UsageError
+from rigwake.text_files import read_text_file
+from rigwake.yaml_input import parse_yaml
 
 Cameras = dict[str, CameraModel]
 
@@ -43,18 +45,14 @@ def read_cameras(path: Path | str, *, fisheye: bool | None = None) -> Cameras:
     """Cameras by name, from any of the known files.
 
     Known: this project's YAML, Kalibr camchains (and EuRoC's sensor.yaml), OpenCV, ROS and CamOdoCal YAML,
+    ORB-SLAM settings,
     OCamCalib's text, Basalt's JSON, COLMAP's cameras.txt. A file of one camera names it by its own name, or
     by the file's stem. fisheye: what an OpenCV file with four coefficients means, if it does not say.
     Raises InputError for a file that cannot be read or is none of these, CameraError for a lens that is not
     known.
     """
     file = Path(path)
-    try:
-        if file.stat().st_size > _MAX_FILE_BYTES:
-            raise InputError(f"{file} is larger than any camera file.")
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file} cannot be read as a camera file: {error}.") from error
+    text = read_text_file(file, _MAX_FILE_BYTES)
     try:
         cameras = _parse(text, file.stem, fisheye)
     except CameraError as error:
@@ -88,9 +86,14 @@ def _parse(text: str, stem: str, fisheye: bool | None) -> Cameras:
     colmap = _from_colmap(text)
     if colmap:
         return colmap
-    plain = load_yaml(text)
+    try:
+        plain = parse_yaml(text, "its text")
+    except InputError as error:
+        raise CameraError(error.cause) from error
     if not isinstance(plain, Mapping):
         return {}
+    if is_orbslam(plain):
+        return cameras_from_orbslam(plain)
     if "model_type" in plain:
         return {str(plain.get("camera_name") or stem): camera_from_camodocal(plain)}
     if "camera_model" in plain:

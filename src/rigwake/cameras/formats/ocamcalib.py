@@ -29,13 +29,13 @@ def camera_from_ocamcalib(text: str, max_angle: float | None = None) -> Scaramuz
             if line.strip() and not line.lstrip().startswith("#")
         ]
         direct, _, (row, column), (c, d, e), (height_px, width_px) = rows[:5]
-        degree = int(direct[0])
-    except ValueError as error:
+        degree, size = int(direct[0]), (int(width_px), int(height_px))
+    except (ValueError, OverflowError) as error:
         raise CameraError("This is not an OCamCalib file: it must hold five rows of numbers.") from error
     if degree != len(direct) - 1:
         raise CameraError(f"The OCamCalib file announces {degree} coefficients and holds {len(direct) - 1}.")
     values = (column, row, c, d, e, *direct[1:])
-    return Scaramuzza(values, int(width_px), int(height_px), max_angle)
+    return Scaramuzza(values, *size, max_angle)
 
 
 def camera_to_ocamcalib(camera: CameraModel) -> str:

@@ -1,6 +1,6 @@
 """YAML files of OpenCV's FileStorage, of ROS's `camera_calibration` and of CamOdoCal.
 
-All are read by a safe loader that knows `!!opencv-matrix`; nothing else is constructed.
+All are read by the loader of `yaml_input`, which knows `!!opencv-matrix`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import yaml
 
 from rigwake._types import Array
 from rigwake.cameras.formats.camera_info import camera_from_info, info_from_camera
@@ -17,25 +16,6 @@ from rigwake.cameras.models.scaramuzza import Scaramuzza
 from rigwake.cameras.protocol import CameraModel
 from rigwake.cameras.registry import camera_from_params
 from rigwake.errors import CameraError
-
-
-class _Loader(yaml.CSafeLoader):
-    """PyYAML's safe loader, and OpenCV's matrices as plain mappings."""
-
-
-def _matrix(loader: yaml.CSafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
-    return loader.construct_mapping(node, deep=True)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
-
-
-def load_yaml(text: str) -> Any:
-    """The content of a YAML text that may start with OpenCV's `%YAML:1.0`; CameraError if it is not YAML."""
-    try:
-        return yaml.load(text.removeprefix("%YAML:1.0"), Loader=_Loader)
-    except yaml.YAMLError as error:
-        raise CameraError(f"The file is not YAML: {error}") from error
 
 
 def _first(plain: Mapping[str, Any], *names: str) -> Any:
@@ -47,7 +27,7 @@ def _first(plain: Mapping[str, Any], *names: str) -> Any:
 
 def _numbers(matrix: Any) -> Array:
     """Values of `{rows, cols, data}`, a list, or a list of lists."""
-    content = matrix["data"] if isinstance(matrix, Mapping) else matrix
+    content = matrix.get("data") if isinstance(matrix, Mapping) else matrix
     try:
         return np.asarray(content, dtype=np.float64).ravel()
     except (TypeError, ValueError) as error:
@@ -57,20 +37,14 @@ def _numbers(matrix: Any) -> Array:
 def camera_from_opencv(
     plain: Mapping[str, Any], *, fisheye: bool | None = None, max_angle: float | None = None
 ) -> CameraModel:
-    """The lens of an OpenCV or ROS calibration file, as `load_yaml` gives it.
+    """The lens of an OpenCV or ROS calibration file, as plain values.
 
     The file's own `distortion_model` or `fisheye_model` decides between pinhole and fisheye. Where it is
     silent, `fisheye` must: CameraError if the four coefficients could be either.
     """
     K = _numbers(_first(plain, "camera_matrix", "K", "Camera_Matrix", "intrinsic_matrix"))
     D = _numbers(_first(plain, "distortion_coefficients", "dist_coeffs", "D", "Distortion_Coefficients"))
-    if "resolution" in plain:
-        width_px, height_px = (int(value) for value in _numbers(plain["resolution"]))
-    else:
-        width_px, height_px = (
-            int(_first(plain, "image_width", "image_Width", "width")),
-            int(_first(plain, "image_height", "image_Height", "height")),
-        )
+    width_px, height_px = _size(plain)
     name = plain.get("distortion_model")
     if name is None:
         declared = plain.get("fisheye_model", fisheye)
@@ -82,6 +56,19 @@ def camera_from_opencv(
             )
         name = "equidistant" if declared else "rational_polynomial" if len(D) > 5 else "plumb_bob"
     return camera_from_info(str(name), D, K, width_px, height_px, max_angle)
+
+
+def _size(plain: Mapping[str, Any]) -> tuple[int, int]:
+    try:
+        if "resolution" in plain:
+            width_px, height_px = (int(value) for value in _numbers(plain["resolution"]))
+            return width_px, height_px
+        return (
+            int(_first(plain, "image_width", "image_Width", "width")),
+            int(_first(plain, "image_height", "image_Height", "height")),
+        )
+    except (TypeError, ValueError, OverflowError) as error:
+        raise CameraError(f"The file does not hold the size of the image: {error}.") from error
 
 
 def camera_to_opencv(camera: CameraModel) -> str:
@@ -114,7 +101,7 @@ def camera_from_camodocal(plain: Mapping[str, Any], max_angle: float | None = No
         groups = {
             group: {str(name): float(value) for name, value in content.items()}
             for group, content in plain.items()
-            if isinstance(content, Mapping)
+            if str(group).endswith("_parameters") and isinstance(content, Mapping)
         }
         if kind == "KANNALA_BRANDT":
             p = groups["projection_parameters"]
