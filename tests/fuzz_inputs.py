@@ -23,8 +23,8 @@ import numpy as np
 import yaml
 
 from rigwake.calibration import CalibratedCamera, Calibration, load_calibration, save_calibration
-from rigwake.cameras.convert import convert_camera
 from rigwake.cameras.formats.camera_files import WRITERS, read_cameras, write_cameras
+from rigwake.cameras.model_fitting import convert_camera
 from rigwake.cameras.registry import camera_from_params
 from rigwake.config import load_config
 from rigwake.errors import RigwakeError

@@ -43,6 +43,9 @@ USED = [
         "3.0 s",
     ),
     ("calibrate {images} -o {here}/c3 --force --view", 3, "3.0 s of images"),
+    ("inspect {images} --camera-file front={lens}", (0, 1, 2), ""),
+    ("calibrate {images} -o {here}/c4 --camera-file front={lens}", (2, 3), ""),
+    ("odometry {images} -o {here}/o4 --camera front --camera-file front={lens}", (1, 2), ""),
     ("inspect {images} --json - --topic camera.front=/a --topics {topics}", 0, '"verdict"'),
     ("inspect {images} --html {here}/page.html", 0, "Not enough to calibrate"),
     (
@@ -77,6 +80,19 @@ USED = [
     ),
     ("undistort {mask} --camera-file {lens} --out {here}/u2", 0, "files in"),
     ("undistort {mask} --camera-file {lens} --camera front --output {here}/u3", 0, "files in"),
+    (
+        "handeye {rig_tum} {port_tum} -o {here}/h9.yaml --frame enu --columns _",
+        (0, 1, 2),
+        "",
+    ),
+    (
+        "convert {images} -o {here}/v1 --to folder --images png --cameras front --start 0 --duration 2 --every 2 "
+        "--topic camera.front=/a --topics {topics} --camera-file front={lens} --json {here}/v1.json",
+        (0, 1, 2),
+        "",
+    ),
+    ("convert {images} --out {here}/v2.bag", 0, "next:"),
+    ("convert {images} --output {here}/v3.mcap", 0, "next:"),
     (
         "intrinsics {corners} --board chessboard:9x6:0.03 --image-size 640x480 --model kb4 --fix k4 --free k3 --fov 90 "
         "--name front -o {here}/front.yaml --plots {here}/plots --json {here}/front.json",

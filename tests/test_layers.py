@@ -23,7 +23,7 @@ LAYERS = [
     ["geometry"],
     ["cameras"],
     ["trajectory", "rig"],
-    ["recording", "tracks", "calibration"],
+    ["recording", "excerpt", "tracks", "calibration"],
     ["evaluation"],
     ["readers", "writers"],
     ["inspection"],

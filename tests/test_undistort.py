@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from camera_lenses import LENSES
-from rigwake.cameras.convert import convert_camera
+from rigwake.cameras.model_fitting import convert_camera
 from rigwake.cameras.models.lens import Lens
 from rigwake.cameras.protocol import CameraModel
 from rigwake.cameras.registry import camera_from_params

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,18 @@ class FrameSource(Protocol):
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64], *, colour: bool = False) -> Iterator[Frame]:
         """Frames in the order of the (increasing) indices; an image that cannot be decoded is left out."""
+
+
+@runtime_checkable
+class EncodedFrameSource(FrameSource, Protocol):
+    """A source whose frames lie encoded (JPEG, PNG) in the recording, and can be handed on as they are."""
+
+    @property
+    def is_encoded(self) -> bool:
+        """Whether they really do; a source over other sources may not know before."""
+
+    def encoded_frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[tuple[int, bytes]]:
+        """Index and encoded image of each frame, not decoded; one of another size is left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,13 +169,41 @@ class Recording:
         return self.cameras[name]
 
 
-def static_transform(recording: Recording, parent: str, child: str) -> SE3 | None:
-    """`parent_from_child` along the chain of static transforms, in either direction; None if there is none.
+def main_imu(recording: Recording) -> ImuStream | None:
+    """The IMU that every verb uses: of those that cover nearly all of the time the one with the most samples."""
+    return _main(list(recording.imus.values()))
 
-    The shortest chain is taken (breadth first).
+
+def main_gnss(recording: Recording) -> GnssStream | None:
+    """The receiver that every verb uses, chosen like the IMU."""
+    return _main(list(recording.gnss.values()))
+
+
+_Stream = TypeVar("_Stream", ImuStream, GnssStream)
+_NEARLY_ALL = 0.9  # of the time that the sensor recording longest covers
+
+
+def _main(streams: Sequence[_Stream]) -> _Stream | None:
+    if not streams:
+        return None
+    seconds = [int(s.timestamps_ns[-1] - s.timestamps_ns[0]) if len(s.timestamps_ns) else 0 for s in streams]
+    covering = [s for s, t in zip(streams, seconds, strict=True) if t >= _NEARLY_ALL * max(seconds)]
+    return min(covering, key=lambda stream: (-len(stream.timestamps_ns), stream.name))
+
+
+def static_transform(recording: Recording, parent: str, child: str) -> SE3 | None:
+    """`parent_from_child` along the chain of the recording's static transforms; None if there is none."""
+    return transform_between(recording.static_transforms, parent, child)
+
+
+def transform_between(transforms: Mapping[tuple[str, str], SE3], parent: str, child: str) -> SE3 | None:
+    """`parent_from_child` along a chain of transforms, in either direction; None if there is none.
+
+    The shortest chain is taken (breadth first). A leading slash of a frame's name does not count, as in tf2.
     """
+    parent, child = parent.lstrip("/"), child.lstrip("/")
     steps: dict[str, list[tuple[str, SE3]]] = {}
-    for (above, below), above_from_below in recording.static_transforms.items():
+    for (above, below), above_from_below in transforms.items():
         steps.setdefault(above, []).append((below, above_from_below))
         steps.setdefault(below, []).append((above, above_from_below.inverse()))
     found = {parent: SE3.identity()}

@@ -11,6 +11,7 @@ from rich.markup import escape
 from rigwake.cli.console import figures_table, next_step, out, print_title, progress_bars, write_json
 from rigwake.cli.options import (
     AllowPartialOption,
+    CameraFileOption,
     JsonOption,
     TopicOption,
     TopicsOption,
@@ -63,6 +64,7 @@ def command(
     print_config: Annotated[bool, typer.Option("--print-config", help="Show all settings and stop.")] = False,
     topic: TopicOption = None,
     topics: TopicsOption = None,
+    camera_file: CameraFileOption = None,
     json_file: JsonOption = None,
 ) -> None:
     """Find where every camera of a recording sits and looks, and how sure that is.
@@ -105,7 +107,7 @@ def command(
             recording,
             out_folder,
             settings,
-            topics=TopicMap.from_options(topic or (), topics),
+            topics=TopicMap.from_options(topic or (), topics, camera_file or ()),
             trajectories=trajectories,
             prior=known,
             resume=resume,

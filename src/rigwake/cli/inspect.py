@@ -12,6 +12,7 @@ from rich.table import Table
 from rigwake.atomic import write_text_atomic
 from rigwake.cli.console import figures_table, next_step, out, progress_bar, write_json
 from rigwake.cli.options import (
+    CameraFileOption,
     JsonOption,
     TopicOption,
     TopicsOption,
@@ -36,6 +37,7 @@ def command(
     ],
     topic: TopicOption = None,
     topics: TopicsOption = None,
+    camera_file: CameraFileOption = None,
     json_file: JsonOption = None,
     html: Annotated[Path | None, typer.Option(help="Write one HTML page with plots.")] = None,
 ) -> None:
@@ -55,7 +57,7 @@ def command(
     from rigwake.readers.open import open_recording
     from rigwake.readers.topics import TopicMap
 
-    opened = open_recording(recording, TopicMap.from_options(topic or (), topics))
+    opened = open_recording(recording, TopicMap.from_options(topic or (), topics, camera_file or ()))
     with progress_bar() as bar:
         task = bar.add_task("reading", total=1)
         inspection = inspect_recording(

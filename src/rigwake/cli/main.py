@@ -32,6 +32,7 @@ VERBS: tuple[str, ...] = (
     "diff",
     "export",
     "report",
+    "convert",
     "simulate",
     "demo",
 )

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rigwake.cli.console import figures_table, next_step, out, progress_bar, write_json
 from rigwake.cli.options import (
     AllowPartialOption,
+    CameraFileOption,
     JsonOption,
     TopicOption,
     TopicsOption,
@@ -82,6 +83,7 @@ def command(
     allow_partial: AllowPartialOption = False,
     topic: TopicOption = None,
     topics: TopicsOption = None,
+    camera_file: CameraFileOption = None,
     json_file: JsonOption = None,
 ) -> None:
     """Where a camera was, frame by frame: metric with an IMU or GNSS, up to scale without, and says so.
@@ -101,9 +103,10 @@ def command(
     from rigwake.pipeline.out_folder import check_camera_names, used_by_one
     from rigwake.readers.open import open_recording
     from rigwake.readers.topics import TopicMap
+    from rigwake.recording import main_gnss, main_imu
     from rigwake.tracking.tracking_options import FrontEndName, TrackingOptions
 
-    opened = open_recording(recording, TopicMap.from_options(topic or (), topics))
+    opened = open_recording(recording, TopicMap.from_options(topic or (), topics, camera_file or ()))
     options = CameraOdometryOptions(
         method=cast(Method, method),
         tracking=TrackingOptions(front_end=cast(FrontEndName, front_end)),
@@ -123,8 +126,8 @@ def command(
         )
     check_camera_names(stream.name for stream in streams)
     sensors = Sensors(
-        _first(opened.imus) if imu else None,
-        _first(opened.gnss) if gnss else None,
+        main_imu(opened) if imu else None,
+        main_gnss(opened) if gnss else None,
         _first(opened.attitudes) if attitude else None,
     )
     with used_by_one(output), unchanged(recording) as check_unchanged:

@@ -49,6 +49,14 @@ TopicOption = Annotated[
 TopicsOption = Annotated[
     Path | None, typer.Option(help="YAML file of the same: camera: {front: /a/b}, imu: /x.")
 ]
+CameraFileOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--camera-file",
+        metavar="[CAMERA=]FILE",
+        help="Lenses from a file of any known format, instead of the recording's. May be repeated.",
+    ),
+]
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Write the result as JSON ('-': print).")]
 AllowPartialOption = Annotated[
     bool,

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from rigwake.cameras.convert import Conversion, convert_camera
+from rigwake.cameras.model_fitting import Conversion, convert_camera
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import CameraError
 from rigwake.exporters.export_base import Notes

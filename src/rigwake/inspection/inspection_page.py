@@ -14,6 +14,7 @@ from rigwake._types import Array
 from rigwake.inspection.readiness import Readiness
 from rigwake.inspection.recording_inspection import Inspection, sensors
 from rigwake.inspection.timing import periods_s
+from rigwake.recording import main_gnss
 
 _MAX_POINTS = 4000  # of one curve
 _COLOURS = {"enough": "#1a7f37", "partly": "#9a6700", "not enough": "#cf222e"}
@@ -120,7 +121,7 @@ def _motion(inspection: Inspection) -> go.Figure | None:
 
 
 def _path(inspection: Inspection) -> go.Figure | None:
-    gnss = next(iter(inspection.recording.gnss.values()), None)
+    gnss = main_gnss(inspection.recording)
     if gnss is None or len(gnss.timestamps_ns) < 2:
         return None
     east, north = _thinned(gnss.position_enu[:, 0], gnss.position_enu[:, 1])

@@ -12,7 +12,7 @@ from rigwake.inspection.picture_samples import Pictures, look_at_pictures, sampl
 from rigwake.inspection.time_offsets import SensorTimeOffset, camera_offset, gnss_offset
 from rigwake.inspection.timing import Timing, timing
 from rigwake.inspection.vessel_motion import Travel, Turning, travel, turning
-from rigwake.recording import Finding, GnssStream, ImuStream, Recording
+from rigwake.recording import Finding, GnssStream, ImuStream, Recording, main_gnss, main_imu
 
 MIN_MOTION_SAMPLES = 50
 _GRAVITY_RANGE = (8.5, 11.0)
@@ -43,9 +43,10 @@ def inspect_recording(recording: Recording, progress: Progress | None = None) ->
     report = progress or (lambda *_: None)
     timings = {key: timing(stream.timestamps_ns) for key, stream in sensors(recording).items()}
     pictures = _pictures(recording, report)
-    imu = next((i for i in recording.imus.values() if len(i.gyro) >= MIN_MOTION_SAMPLES), None)
+    imu = main_imu(recording)
+    imu = imu if imu is not None and len(imu.gyro) >= MIN_MOTION_SAMPLES else None
     turn = turning(imu) if imu is not None else None
-    gnss = next(iter(recording.gnss.values()), None)
+    gnss = main_gnss(recording)
     path = travel(gnss) if gnss is not None else None
     time_offsets = _time_offsets(imu, gnss, pictures)
     findings = (*recording.findings, *_timing_findings(timings), *_picture_findings(pictures))

@@ -70,13 +70,13 @@ def _levelled(gyro: Array, up_measured: Array, steps_s: Array, settling_s: float
             R[2, k] += gain * (up_measured[i, k] - R[2, k])
             norm_z += R[2, k] ** 2
         for k in range(3):
-            R[2, k] /= np.sqrt(norm_z)
+            R[2, k] /= max(np.sqrt(norm_z), 1e-12)  # damaged samples may cancel each other
             dot += R[0, k] * R[2, k]
         for k in range(3):
             R[0, k] -= dot * R[2, k]
             norm += R[0, k] ** 2
         for k in range(3):
-            R[0, k] /= np.sqrt(norm)
+            R[0, k] /= max(np.sqrt(norm), 1e-12)
         for k in range(3):
             a, b = (k + 1) % 3, (k + 2) % 3
             R[1, k] = R[2, a] * R[0, b] - R[2, b] * R[0, a]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigwake.cameras.convert import convert_camera
+from rigwake.cameras.model_fitting import convert_camera
 from rigwake.cameras.models.kannala_brandt import KannalaBrandt4
 from rigwake.cameras.models.lens import Lens
 from rigwake.cameras.protocol import CameraModel

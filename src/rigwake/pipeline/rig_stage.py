@@ -26,7 +26,7 @@ from rigwake.errors import InputError, UnobservableError
 from rigwake.geometry.se3 import SE3
 from rigwake.pipeline.prior import RigPrior
 from rigwake.pipeline.stream_selection import Selection
-from rigwake.recording import Recording
+from rigwake.recording import Recording, static_transform
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
@@ -151,20 +151,22 @@ def _conclude(
 def reference_frame(
     recording: Recording, selection: Selection, first: InitialRig | None, wanted: str
 ) -> ReferenceFrame:
-    """The frame to report in; `base_link` needs the recording to say where the IMU sits on it.
+    """The frame to report in; one of the tf tree (`base_link`) needs a chain of static transforms to the IMU's.
 
     first: needed for `auto` without an IMU only."""
     if wanted == "auto":
         wanted = "imu" if selection.imu is not None or first is None else first.reference_camera
     if wanted == "imu" and selection.imu is not None:
         return ReferenceFrame("imu", SE3.identity())
-    if wanted == "base_link" and selection.imu is not None:
-        base_from_imu = recording.static_transforms.get(("base_link", selection.imu.frame_id))
-        if base_from_imu is None:
+    frames = sorted({frame for edge in recording.static_transforms for frame in edge})
+    is_frame = wanted == "base_link" or wanted.lstrip("/") in frames
+    if is_frame and wanted not in selection.cameras and selection.imu is not None:
+        reference_from_imu = static_transform(recording, wanted, selection.imu.frame_id)
+        if reference_from_imu is None:
             raise InputError(
-                "The recording does not say where the IMU sits on base_link.",
+                f"The recording does not say where the IMU sits on {wanted}.",
                 consequence="The cameras are known in the IMU's frame only.",
-                remedy="Use --reference imu, or record /tf_static.",
+                remedy=f"Use --reference imu, or record /tf_static. Its frames: {', '.join(frames) or 'none'}.",
             )
-        return ReferenceFrame("base_link", base_from_imu)
+        return ReferenceFrame(wanted, reference_from_imu)
     return ReferenceFrame(wanted, None)

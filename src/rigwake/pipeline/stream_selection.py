@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,16 @@ from numpy.typing import NDArray
 from rigwake.config import CalibrateConfig
 from rigwake.errors import InputError, UnobservableError, UsageError
 from rigwake.odometry.imu_alignment import with_noise
-from rigwake.recording import CameraStream, Frame, FrameSource, GnssStream, ImuStream, Recording
+from rigwake.recording import (
+    CameraStream,
+    Frame,
+    FrameSource,
+    GnssStream,
+    ImuStream,
+    Recording,
+    main_gnss,
+    main_imu,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +75,8 @@ def select(recording: Recording, config: CalibrateConfig) -> Selection:
             remedy="Record one to two minutes with turns to both sides.",
         )
     notes: list[str] = []
-    imu = _one("IMU", recording.imus, config.imu, notes)
-    gnss = _one("GNSS receiver", recording.gnss, config.gnss, notes)
+    imu = _one("IMU", main_imu(recording), recording.imus, config.imu, notes)
+    gnss = _one("GNSS receiver", main_gnss(recording), recording.gnss, config.gnss, notes)
     notes.extend(
         f"attitude {name}: not used; beside an IMU it tells nothing new of the rig, without one its mounting is unknown"
         for name in recording.attitudes
@@ -88,15 +98,20 @@ def select(recording: Recording, config: CalibrateConfig) -> Selection:
     return Selection(windowed, known, gnss, tuple(notes), left_out)
 
 
-def _one(what: str, streams: Mapping[str, object], wanted: bool, notes: list[str]):  # type: ignore[no-untyped-def]
-    """The stream with the most samples, if any is wanted."""
-    if not wanted or not streams:
+_Sensor = TypeVar("_Sensor", ImuStream, GnssStream)
+
+
+def _one(
+    what: str, main: _Sensor | None, streams: Mapping[str, object], wanted: bool, notes: list[str]
+) -> _Sensor | None:
+    """The sensor that every verb uses, if any is wanted; notes which are not used."""
+    if not wanted or main is None:
         notes.append(f"no {what} " + ("in the recording" if wanted else "used, as asked"))
         return None
-    name = max(streams, key=lambda n: len(streams[n].timestamps_ns))  # type: ignore[attr-defined]
     if len(streams) > 1:
-        notes.append(f"{what} {name} used, the others ({', '.join(n for n in streams if n != name)}) not")
-    return streams[name]
+        others = ", ".join(name for name in streams if name != main.name)
+        notes.append(f"{what} {main.name} used, the others ({others}) not")
+    return main
 
 
 def _with_noise(imu: ImuStream, config: CalibrateConfig, notes: list[str]) -> ImuStream:

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal, Protocol
 
 import numpy as np
 
 from rigwake._types import Stamps
+from rigwake.errors import InputError
 from rigwake.recording import Finding
 
 Encoding = Literal["ros1", "cdr"]
@@ -58,19 +60,20 @@ class BagIndex:
 
 @dataclass(frozen=True, eq=False)
 class JoinedPayloads:
-    """Several connections, or several files of a split bag, one after the other."""
+    """Messages of several connections or files in one order: row i is row `part_rows[i]` of `parts[part_of[i]]`."""
 
     parts: tuple[Payloads, ...]
-    first_rows: tuple[int, ...]
+    part_of: Stamps
+    part_rows: Stamps
 
     def read(self, rows: Iterable[int], limit_bytes: int = MAX_MESSAGE_BYTES) -> Iterator[bytes]:
         """See `Payloads.read`; runs of rows of one part are read together."""
         wanted = np.fromiter(rows, dtype=np.int64)
-        part_of = np.searchsorted(self.first_rows, wanted, side="right") - 1
+        part_of = self.part_of[wanted]
         for run in np.split(np.arange(len(wanted)), np.flatnonzero(np.diff(part_of)) + 1):
             if len(run):
-                part = int(part_of[run[0]])
-                yield from self.parts[part].read(wanted[run] - self.first_rows[part], limit_bytes)
+                part = self.parts[int(part_of[run[0]])]
+                yield from part.read(self.part_rows[wanted[run]], limit_bytes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +88,10 @@ class HeldPayloads:
 
 
 def joined(channels: Sequence[Channel]) -> tuple[Channel, ...]:
-    """One channel per (topic, type): connections of several publishers and files of a split bag are merged."""
+    """One channel per (topic, type), in the order of recording.
+
+    Connections of several publishers and files of a split bag are merged by the time of recording.
+    """
     groups: dict[tuple[str, str], list[Channel]] = {}
     for channel in channels:
         groups.setdefault((channel.topic, channel.message_type), []).append(channel)
@@ -93,14 +99,23 @@ def joined(channels: Sequence[Channel]) -> tuple[Channel, ...]:
 
 
 def _join(group: Sequence[Channel]) -> Channel:
-    if len(group) == 1:
+    times = np.concatenate([c.log_times_ns for c in group])
+    if len(group) == 1 and (np.diff(times) >= 0).all():
         return group[0]
-    first_rows = np.cumsum([0, *(len(c) for c in group[:-1])])
+    order = np.argsort(times, kind="stable")
+    part_of = np.repeat(np.arange(len(group)), [len(c) for c in group])
+    part_rows = np.concatenate([np.arange(len(c)) for c in group])
     return replace(
-        group[0],
-        log_times_ns=np.concatenate([c.log_times_ns for c in group]),
-        payloads=JoinedPayloads(tuple(c.payloads for c in group), tuple(int(row) for row in first_rows)),
+        max(group, key=len),
+        log_times_ns=times[order],
+        payloads=JoinedPayloads(tuple(c.payloads for c in group), part_of[order], part_rows[order]),
     )
+
+
+def require_regular_file(path: Path) -> None:
+    """InputError for a pipe, a socket or a device: reading it would block for ever, or never end."""
+    if not path.is_file():
+        raise InputError(f"{path.name} is not a file.", remedy="Give a file or a folder.")
 
 
 def standard_type_name(message_type: str) -> str:

@@ -9,6 +9,7 @@ import bz2
 import io
 import os
 import struct
+import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,12 @@ Framing = Literal["ros1", "mcap"]
 MAX_CHUNK_BYTES = 2**30
 """A chunk that claims to unpack to more is damage (recorders write 1 to 16 MB)."""
 
+MAX_RATIO = 1000
+"""What is packed tighter than this (beyond `FREE_BYTES` per file) is made to fill the memory, not recorded."""
+
+FREE_BYTES = 2**28
+
+_REFUSED = "beyond the limit"
 _PEEK_BYTES = 512  # covers the record header of a message, and of an image its stamp and frame
 
 
@@ -37,6 +44,27 @@ class Chunk(NamedTuple):
     stored_bytes: int
     content_bytes: int
     compression: str
+    crc: int = 0
+    """CRC-32 of the content; 0 where the file states none."""
+
+
+def within_budget(chunks: Sequence[Chunk]) -> tuple[list[Chunk], int]:
+    """The chunks, of which those beyond the budget of unpacked bytes are refused, and how many those are.
+
+    The budget of a file is `FREE_BYTES + MAX_RATIO * stored bytes`: a few kilobytes cannot ask for gigabytes.
+    """
+    budget = FREE_BYTES + MAX_RATIO * sum(min(c.stored_bytes, MAX_CHUNK_BYTES) for c in chunks)
+    kept, refused = [], 0
+    for chunk in chunks:
+        tightest = FREE_BYTES // 4 + MAX_RATIO * chunk.stored_bytes
+        if chunk.compression != "none":
+            if chunk.content_bytes > min(budget, tightest):
+                refused += 1
+                chunk = chunk._replace(compression=_REFUSED)
+            else:
+                budget -= chunk.content_bytes
+        kept.append(chunk)
+    return kept, refused
 
 
 def unpack(stored: bytes, chunk: Chunk) -> bytes:
@@ -44,8 +72,15 @@ def unpack(stored: bytes, chunk: Chunk) -> bytes:
 
     Raises InputError if it is damaged, too large or packed in an unknown way.
     """
-    if chunk.content_bytes > MAX_CHUNK_BYTES:
-        raise InputError(f"A chunk claims to hold {chunk.content_bytes} bytes.")
+    if chunk.content_bytes > MAX_CHUNK_BYTES or chunk.compression == _REFUSED:
+        raise InputError(f"A chunk of {len(stored)} bytes claims to hold {chunk.content_bytes} bytes.")
+    content = _unpacked(stored, chunk)
+    if chunk.crc and zlib.crc32(content) != chunk.crc:
+        raise InputError("A chunk does not match its checksum.")
+    return content
+
+
+def _unpacked(stored: bytes, chunk: Chunk) -> bytes:
     try:
         match chunk.compression:
             case "none":
@@ -55,7 +90,9 @@ def unpack(stored: bytes, chunk: Chunk) -> bytes:
             case "bz2":
                 return bz2.BZ2Decompressor().decompress(stored, chunk.content_bytes)
             case "zstd":
-                with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(stored)) as reader:
+                with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(
+                    io.BytesIO(stored)
+                ) as reader:
                     return bytes(reader.read(chunk.content_bytes))
     except (RuntimeError, OSError, EOFError, ValueError, zstandard.ZstdError) as error:
         raise InputError(f"A chunk cannot be unpacked ({error}).") from error
@@ -69,11 +106,17 @@ def read_chunk(file: int, chunk: Chunk) -> bytes:
     return unpack(os.pread(file, chunk.stored_bytes, chunk.position), chunk)
 
 
-def message_span(record: bytes, framing: Framing) -> tuple[int, int]:
-    """Start and length of the message within a message record; InputError where this is not one."""
+def message_span(record: bytes, framing: Framing, owner: int | None = None) -> tuple[int, int]:
+    """Start and length of the message within a message record; InputError where this is not one.
+
+    owner: the connection (ROS 1) or channel (MCAP) that the message must be of; a damaged index may point at
+    another's.
+    """
     try:
         if framing == "ros1":
             (header_bytes,) = struct.unpack_from("<I", record, 0)
+            if owner is not None and b"conn=" + struct.pack("<I", owner) not in record[: 4 + header_bytes]:
+                raise InputError("An index entry points at a message of another topic.")
             (message_bytes,) = struct.unpack_from("<I", record, 4 + header_bytes)
             start = 8 + header_bytes
         else:
@@ -81,6 +124,8 @@ def message_span(record: bytes, framing: Framing) -> tuple[int, int]:
             start, message_bytes = 31, record_bytes - 22
             if opcode != 0x05:
                 raise InputError("An index entry does not point at a message.")
+            if owner is not None and struct.unpack_from("<H", record, 9)[0] != owner:
+                raise InputError("An index entry points at a message of another topic.")
     except struct.error as error:
         raise InputError("A message record is cut off.") from error
     if not 0 <= message_bytes <= MAX_MESSAGE_BYTES:
@@ -90,13 +135,17 @@ def message_span(record: bytes, framing: Framing) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class ChunkedPayloads:
-    """Messages by (chunk, offset): chunk_rows (N,) into `chunks`, offsets (N,) of their records therein."""
+    """Messages by (chunk, offset): chunk_rows (N,) into `chunks`, offsets (N,) of their records therein.
+
+    owners: (N,) the connection or channel that each message is of.
+    """
 
     path: Path
     framing: Framing
     chunks: tuple[Chunk, ...]
     chunk_rows: NDArray[np.int32]
     offsets: NDArray[np.int64]
+    owners: NDArray[np.int64]
 
     @property
     def is_packed(self) -> bool:
@@ -113,9 +162,49 @@ class ChunkedPayloads:
                 chunk = self.chunks[chunk_row]
                 if chunk_row != held:
                     held, content = chunk_row, _content(file, chunk)
-                yield _message(file, chunk, content, int(self.offsets[row]), self.framing, limit_bytes)
+                yield self.message(file, content, int(row), limit_bytes)
         finally:
             os.close(file)
+
+    def message(self, file: int, content: bytes | None, row: int, limit_bytes: int) -> bytes:
+        """One message, from the content of its chunk if that was packed; empty if it cannot be read."""
+        chunk, offset = self.chunks[int(self.chunk_rows[row])], int(self.offsets[row])
+        where = chunk.position + offset
+        record = (
+            os.pread(file, _PEEK_BYTES, where) if content is None else content[offset : offset + _PEEK_BYTES]
+        )
+        try:
+            start, message_bytes = message_span(record, self.framing, int(self.owners[row]))
+        except InputError:
+            return b""
+        if offset + start + message_bytes > chunk.content_bytes:
+            return b""
+        wanted = min(message_bytes, limit_bytes)
+        if start + wanted <= len(record):
+            return record[start : start + wanted]
+        if content is None:
+            return os.pread(file, wanted, where + start)
+        return content[offset + start : offset + start + wanted]
+
+
+def payloads_in_order(
+    path: Path,
+    framing: Framing,
+    chunks: Sequence[Chunk],
+    parts: Sequence[tuple[int, int, NDArray[np.int64]]],
+    times_ns: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], ChunkedPayloads]:
+    """The times, and the messages, in the order of recording.
+
+    parts: owner, chunk row and offsets (n,) of messages of one topic; times_ns: of all of them, part after part.
+    """
+    counts = [len(offsets) for _, _, offsets in parts]
+    offsets = np.concatenate([np.empty(0, np.int64), *(offsets for _, _, offsets in parts)])
+    chunk_rows = np.repeat([row for _, row, _ in parts], counts).astype(np.int32)
+    owners = np.repeat([owner for owner, _, _ in parts], counts).astype(np.int64)
+    order = np.lexsort((offsets, chunk_rows, times_ns))
+    payloads = ChunkedPayloads(path, framing, tuple(chunks), chunk_rows[order], offsets[order], owners[order])
+    return times_ns[order], payloads
 
 
 def _content(file: int, chunk: Chunk) -> bytes | None:
@@ -128,43 +217,27 @@ def _content(file: int, chunk: Chunk) -> bytes | None:
         return b""  # its messages come out empty, and whoever decodes them counts them as damaged
 
 
-def _message(
-    file: int, chunk: Chunk, content: bytes | None, offset: int, framing: Framing, limit_bytes: int
-) -> bytes:
-    where = chunk.position + offset
-    peek = slice(offset, offset + _PEEK_BYTES)
-    record = os.pread(file, _PEEK_BYTES, where) if content is None else content[peek]
-    try:
-        start, message_bytes = message_span(record, framing)
-    except InputError:
-        return b""
-    if offset + start + message_bytes > chunk.content_bytes:
-        return b""
-    wanted = min(message_bytes, limit_bytes)
-    if start + wanted <= len(record):
-        return record[start : start + wanted]
-    if content is None:
-        return os.pread(file, wanted, where + start)
-    return content[offset + start : offset + start + wanted]
-
-
 def read_together(wanted: Sequence[tuple[ChunkedPayloads, int]]) -> list[list[bytes]]:
     """All messages of several channels of one file, each cut after its limit; every chunk is unpacked once.
 
     Otherwise a packed file would be unpacked again for every channel.
     """
-    messages: list[list[bytes]] = [[] for _ in wanted]
+    messages: list[list[bytes]] = [[b""] * len(payloads.offsets) for payloads, _ in wanted]
     if not wanted:
         return messages
     first = wanted[0][0]
-    ends = [np.searchsorted(p.chunk_rows, np.arange(len(p.chunks)), side="right") for p, _ in wanted]
+    orders = [np.argsort(p.chunk_rows, kind="stable") for p, _ in wanted]
+    ends = [
+        np.searchsorted(p.chunk_rows[order], np.arange(-1, len(first.chunks)), side="right")
+        for (p, _), order in zip(wanted, orders, strict=True)
+    ]
     file = os.open(first.path, os.O_RDONLY)
     try:
         for chunk_row, chunk in enumerate(first.chunks):
             content = _content(file, chunk)
-            for (payloads, limit), end, read in zip(wanted, ends, messages, strict=True):
-                offsets = payloads.offsets[len(read) : end[chunk_row]]
-                read += [_message(file, chunk, content, int(at), first.framing, limit) for at in offsets]
+            for (payloads, limit), order, end, read in zip(wanted, orders, ends, messages, strict=True):
+                for row in order[end[chunk_row] : end[chunk_row + 1]].tolist():
+                    read[row] = payloads.message(file, content, row, limit)
     finally:
         os.close(file)
     return messages

@@ -12,14 +12,15 @@ from rigwake.cameras.protocol import CameraModel
 from rigwake.cameras.registry import camera_from_params
 from rigwake.errors import CameraError, InputError
 from rigwake.geometry.se3 import SE3
-from rigwake.readers.csv_sensors import read_imu_csv
+from rigwake.readers.csv_sensors import read_attitude_csv, read_gnss_csv, read_imu_csv
 from rigwake.readers.csv_tables import read_table
+from rigwake.readers.folder import read_trajectory_folder
 from rigwake.readers.image_files import FileFrames, first_file_size
 from rigwake.readers.images import ImageSize
 from rigwake.readers.rig_file import rigid_transform
 from rigwake.readers.streams import time_order
 from rigwake.readers.trajectories import read_trajectory
-from rigwake.recording import CameraStream, Finding, ImuStream, Recording
+from rigwake.recording import AttitudeStream, CameraStream, Finding, GnssStream, ImuStream, Recording
 from rigwake.rig import Rig, RigCamera
 from rigwake.trajectory import Trajectory
 from rigwake.yaml_input import read_yaml_settings
@@ -34,6 +35,8 @@ class _EurocStreams:
     cameras: dict[str, CameraStream] = field(default_factory=dict)
     rig_cameras: dict[str, RigCamera] = field(default_factory=dict)
     imus: dict[str, ImuStream] = field(default_factory=dict)
+    gnss: dict[str, GnssStream] = field(default_factory=dict)
+    attitudes: dict[str, AttitudeStream] = field(default_factory=dict)
     rig_from_imu: SE3 | None = None
     findings: list[Finding] = field(default_factory=list)
 
@@ -62,6 +65,8 @@ def read_euroc(path: Path) -> Recording:
                 _add_camera(folder, kalibr.get(folder.name), found)
             elif folder.name.startswith("imu"):
                 _add_imu(folder, found)
+            else:
+                _add_own(folder, found)
         except InputError as error:
             found.findings.append(Finding("error", folder.name, f"left out: {error.cause}"))
     if not found.cameras and not found.imus:
@@ -73,9 +78,13 @@ def read_euroc(path: Path) -> Recording:
         "euroc folder",
         found.cameras,
         found.imus,
-        poses=_trajectories(root, _POSE_FOLDERS, found.findings),
+        found.gnss,
+        found.attitudes,
+        poses=_trajectories(root, _POSE_FOLDERS, found.findings)
+        | read_trajectory_folder(root / "poses", found.findings),
         true_rig=Rig("body", found.rig_cameras, rig_from_imu=found.rig_from_imu) if has_rig else None,
-        true_trajectories=_trajectories(root, _TRUTH_FOLDERS, found.findings),
+        true_trajectories=_trajectories(root, _TRUTH_FOLDERS, found.findings)
+        | read_trajectory_folder(root / "truth", found.findings),
         findings=tuple(found.findings),
     )
 
@@ -144,6 +153,11 @@ def _camera_settings(
                 f"sensor.yaml is for {settings['resolution']} pixels, images are {size.width_px} x "
                 f"{size.height_px}: its intrinsics are not used."
             )
+        if "intrinsics" not in settings:
+            found.findings.append(
+                Finding("warning", name, "no intrinsics in sensor.yaml: they must be given.")
+            )
+            return None, body_from_cam
         return _lens(settings, coefficients, size), body_from_cam
     except (InputError, CameraError) as error:
         found.findings.append(Finding("warning", name, error.cause))
@@ -187,6 +201,22 @@ def _add_imu(folder: Path, found: _EurocStreams) -> None:
         except (TypeError, KeyError) as error:
             found.findings.append(Finding("warning", folder.name, f"T_BS is damaged ({error})."))
     found.imus[folder.name] = replace(stream, topic=folder.name)
+
+
+def _add_own(folder: Path, found: _EurocStreams) -> None:
+    """Folders that `writers.euroc` adds to the format."""
+    table = folder / "data.csv"
+    if not table.is_file():
+        return
+    if folder.name.startswith("gnss"):
+        gnss, repaired = read_gnss_csv(table, folder.name)
+        found.gnss[folder.name] = replace(gnss, topic=folder.name)
+    elif folder.name.startswith("attitude"):
+        attitude, repaired = read_attitude_csv(table, folder.name)
+        found.attitudes[folder.name] = replace(attitude, topic=folder.name)
+    else:
+        return
+    found.findings += repaired
 
 
 def _positive(value: Any) -> float | None:

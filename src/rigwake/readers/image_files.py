@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rigwake._types import Stamps
 from rigwake.errors import InputError
-from rigwake.readers.images import ImageSize
+from rigwake.readers.images import ImageSize, complete_size, image_kind
 from rigwake.readers.picture_files import (
     IMAGE_SUFFIXES,
     bits_in_use,
@@ -71,6 +71,25 @@ class FileFrames:
                 continue
             if image.shape[:2] == (self.size.height_px, self.size.width_px):
                 yield Frame(int(index), int(self.timestamps_ns[index]), image)
+
+    @property
+    def is_encoded(self) -> bool:
+        """Whether the first file is a JPEG or a PNG."""
+        try:
+            return bool(self.names) and image_kind(read_bytes(self.folder / self.names[0])) != ""
+        except InputError:
+            return False
+
+    def encoded_frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[tuple[int, bytes]]:
+        """See `EncodedFrameSource.encoded_frames`."""
+        for index in indices:
+            try:
+                encoded = read_bytes(self.folder / self.names[index])
+                if complete_size(encoded) != self.size:
+                    continue
+            except InputError:
+                continue
+            yield int(index), encoded
 
 
 def _spread(paths: Sequence[Path], count: int) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from typing import NamedTuple
 
@@ -12,23 +13,15 @@ from numpy.typing import NDArray
 from rigwake._types import Image
 from rigwake.errors import InputError
 from rigwake.readers.jpeg_fill import is_filled_up
+from rigwake.readers.pixel_encodings import decode_pixels, eight_bits
 
 MAX_PIXELS = 2**27
 """134 megapixels: above any machine-vision sensor, below what endangers memory."""
 
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _JPEG_FRAME_MARKERS = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
-_TAIL_BYTES = 4096  # an end marker may be followed by padding
-
-# ROS names a Bayer pattern by its first row, OpenCV 4 and 5 by the second
-_BAYER_BGR = {
-    "bayer_rggb": cv2.COLOR_BayerBG2BGR,
-    "bayer_bggr": cv2.COLOR_BayerRG2BGR,
-    "bayer_gbrg": cv2.COLOR_BayerGR2BGR,
-    "bayer_grbg": cv2.COLOR_BayerGB2BGR,
-}
-_CHANNELS = {"mono": 1, "bgr": 3, "rgb": 3, "bgra": 4, "rgba": 4, **dict.fromkeys(_BAYER_BGR, 1)}
-_GENERIC = {"8UC1": "mono8", "16UC1": "mono16", "8UC3": "bgr8", "8UC4": "bgra8", "16UC3": "bgr16"}
+_JPEG_END = 0xD9
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]", re.DOTALL)  # neither data nor a restart
 
 
 class ImageSize(NamedTuple):
@@ -61,6 +54,24 @@ def compressed_size(encoded: bytes) -> ImageSize:
     raise InputError("A compressed image is neither JPEG nor PNG.")
 
 
+def complete_size(encoded: bytes) -> ImageSize:
+    """The same of an image that is whole; InputError also where its end is missing."""
+    size = compressed_size(encoded)
+    _check_complete(encoded)
+    return size
+
+
+def image_kind(encoded: bytes) -> str:
+    """`jpeg`, `png`, or `deep png` for one of 16 bits per sample; InputError for anything else."""
+    if is_deep_png(encoded):
+        return "deep png"
+    if encoded.startswith(_PNG):
+        return "png"
+    if encoded.startswith(_JPEG):
+        return "jpeg"
+    raise InputError("A compressed image is neither JPEG nor PNG.")
+
+
 def _jpeg_size(encoded: bytes) -> ImageSize:
     at = 2
     while True:
@@ -78,19 +89,50 @@ def _jpeg_size(encoded: bytes) -> ImageSize:
 
 def _check_complete(encoded: bytes) -> None:
     """Decoders fill what is missing with grey without a word, so ask for the end marker."""
-    end = b"IEND" if encoded.startswith(_PNG) else b"\xff\xd9"
-    if end not in encoded[-_TAIL_BYTES:]:
+    complete = _png_end(encoded) if encoded.startswith(_PNG) else _jpeg_end(encoded)
+    if not complete:
         raise InputError("A compressed image is cut off.")
 
 
-def decode_compressed(encoded: bytes, *, colour: bool) -> Image:
+def _png_end(encoded: bytes) -> bool:
+    """Whether the chunks of a PNG lead to its end; what follows it does not matter."""
+    at = len(_PNG)
+    while at + 12 <= len(encoded):
+        (content_bytes,) = struct.unpack_from(">I", encoded, at)
+        if encoded[at + 4 : at + 8] == b"IEND":
+            return True
+        at += 12 + content_bytes
+    return False
+
+
+def _jpeg_end(encoded: bytes) -> bool:
+    """Whether the segments and scans of a JPEG lead to its end marker; what follows it does not matter.
+
+    V4L2 drivers deliver whole buffers: behind the image stand zeros, or the rest of an earlier image.
+    """
+    at = 2
+    while (found := _JPEG_MARKER.search(encoded, at)) is not None:
+        marker = encoded[found.start() + 1]
+        if marker == _JPEG_END:
+            return True
+        if found.start() + 4 > len(encoded):
+            return False
+        at = found.start() + 2 + struct.unpack_from(">H", encoded, found.start() + 2)[0]
+    return False
+
+
+def decode_compressed(encoded: bytes, *, colour: bool, used_bits: int | None = None) -> Image:
     """Decode a JPEG or PNG image as stored (EXIF rotation ignored: intrinsics refer to stored pixels).
 
+    used_bits: of a PNG of 16 bits, how many are in use; the 8 highest of them are kept.
     Returns (H, W) grey, or (H, W, 3) BGR. Raises InputError if it is damaged, cut off or too large.
     """
     compressed_size(encoded)
     _check_complete(encoded)
     flags = (cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE) | cv2.IMREAD_IGNORE_ORIENTATION
+    is_deep = used_bits is not None and is_deep_png(encoded)
+    if is_deep:
+        flags |= cv2.IMREAD_ANYDEPTH
     try:
         image = cv2.imdecode(np.frombuffer(encoded, np.uint8), flags)
     except cv2.error as error:
@@ -99,17 +141,12 @@ def decode_compressed(encoded: bytes, *, colour: bool) -> Image:
         raise InputError("A compressed image cannot be decoded.")
     if is_filled_up(encoded, image):
         raise InputError("A compressed image is cut off, although it has an end marker.")
-    return image
+    return eight_bits(image, used_bits) if is_deep and used_bits and image.dtype == np.uint16 else image
 
 
-def _pixel_layout(encoding: str) -> tuple[str, int, int]:
-    """Name without bit depth, channels and bytes per sample of a ROS image encoding."""
-    named = _GENERIC.get(encoding, encoding)
-    name = named.rstrip("0123456789")
-    bits = named.removeprefix(name)
-    if name not in _CHANNELS or bits not in ("8", "16"):
-        raise InputError(f"Image encoding {encoding!r} is not mono, bgr(a), rgb(a) or Bayer of 8 or 16 bit.")
-    return name, _CHANNELS[name], int(bits) // 8
+def is_deep_png(encoded: bytes) -> bool:
+    """Whether this is a PNG of 16 bits per sample."""
+    return encoded.startswith(_PNG) and encoded[24:25] == b"\x10"
 
 
 def decode_raw(
@@ -120,29 +157,19 @@ def decode_raw(
     *,
     big_endian: bool,
     colour: bool,
+    used_bits: int | None = None,
 ) -> Image:
-    """Convert a ROS `sensor_msgs/Image` buffer; of 16-bit samples the high byte is kept.
+    """Convert a ROS `sensor_msgs/Image` buffer; of deeper samples the 8 highest of `used_bits` are kept.
 
-    Returns (H, W) grey, or (H, W, 3) BGR. Raises InputError if the buffer does not fit what is declared.
+    Returns (H, W) grey, or (H, W, 3) BGR. Raises InputError if the buffer does not fit what is declared, or
+    the encoding cannot be decoded.
     """
-    name, channels, sample_bytes = _pixel_layout(encoding)
-    width_px, height_px = checked_size(*size)
-    used = width_px * channels * sample_bytes
-    row_bytes = row_bytes or used
-    if row_bytes < used or len(pixels) < row_bytes * (height_px - 1) + used:
-        raise InputError(f"An image of {width_px} x {height_px} {encoding} holds only {len(pixels)} bytes.")
-    rows = np.lib.stride_tricks.as_strided(pixels, (height_px, used), (row_bytes, 1))
-    samples = rows.reshape(height_px, width_px, channels, sample_bytes)
-    image = samples[..., 0 if big_endian or sample_bytes == 1 else 1]
-    return _converted(np.ascontiguousarray(image), name, colour=colour)
-
-
-def _converted(image: Image, name: str, *, colour: bool) -> Image:
-    if name == "mono":
-        return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if colour else image[..., 0]
-    if name in _BAYER_BGR:
-        image = cv2.cvtColor(image[..., 0], _BAYER_BGR[name])
-    elif name in ("rgb", "rgba", "bgra"):
-        code = {"rgb": cv2.COLOR_RGB2BGR, "rgba": cv2.COLOR_RGBA2BGR}.get(name, cv2.COLOR_BGRA2BGR)
-        image = cv2.cvtColor(image, code)
-    return image if colour else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return decode_pixels(
+        pixels,
+        checked_size(*size),
+        row_bytes,
+        encoding,
+        big_endian=big_endian,
+        colour=colour,
+        used_bits=used_bits,
+    )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import struct
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -22,16 +23,20 @@ from rigwake.readers.channels import (
     Channel,
     Encoding,
     joined,
+    require_regular_file,
     standard_type_name,
 )
-from rigwake.readers.chunks import Chunk, ChunkedPayloads, read_chunk
+from rigwake.readers.chunks import Chunk, payloads_in_order, read_chunk, within_budget
+from rigwake.readers.printable import printable
 from rigwake.recording import Finding
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
+_STATISTICS = 0x0B
 _ENCODINGS: dict[str, Encoding] = {"ros1": "ros1", "cdr": "cdr"}
 _COMPRESSIONS = {"": "none", "lz4": "lz4", "zstd": "zstd"}
 _ENTRY = np.dtype([("time", "<u8"), ("offset", "<u8")])
+_CHECKED_BYTES = 2**29  # of chunks that are not packed; checking all of a long recording would take minutes
 _MAX_SMALL_RECORD = 2**24  # schemas, channels and indices; messages and chunks are not read whole
 
 
@@ -50,12 +55,16 @@ class _McapScan:
     channels: dict[int, _ChannelRecord] = field(default_factory=dict)
     entries: dict[int, list[tuple[int, NDArray[np.void]]]] = field(default_factory=dict)
     indexed_chunks: set[int] = field(default_factory=set)
+    suspect_chunks: set[int] = field(default_factory=set)
+    """Chunks whose index contradicts itself or the chunk: they are walked through instead."""
     loose: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
+    stated_messages: int | None = None
     problems: list[str] = field(default_factory=list)
 
 
 def index_mcap(path: Path) -> BagIndex:
     """Index an MCAP file; damage is reported in `findings`. InputError if it is no MCAP file."""
+    require_regular_file(path)
     file = os.open(path, os.O_RDONLY)
     try:
         if os.pread(file, len(MAGIC), 0) != MAGIC:
@@ -63,6 +72,10 @@ def index_mcap(path: Path) -> BagIndex:
         file_bytes = os.fstat(file).st_size
         scan = _McapScan()
         _scan_records(file, file_bytes, scan)
+        scan.chunks, refused = within_budget(scan.chunks)
+        if refused:
+            scan.problems.append(f"{refused} chunks claim to hold far more than the file can pack")
+        _check_plain_chunks(file, scan)
         _complete_from_chunks(file, scan)
     finally:
         os.close(file)
@@ -70,7 +83,12 @@ def index_mcap(path: Path) -> BagIndex:
     for channel, loose in scan.loose.items():
         entry = (len(scan.chunks) - 1, np.array(loose, _ENTRY))
         scan.entries.setdefault(channel, []).append(entry)
+    found = sum(len(entries) for parts in scan.entries.values() for _, entries in parts)
+    if scan.stated_messages not in (None, found):
+        scan.problems.append(f"The file counts {scan.stated_messages} messages, {found} were found")
     channels, other = _channels(path, scan)
+    if scan.suspect_chunks:
+        scan.problems.append(f"The index of {len(scan.suspect_chunks)} chunks is damaged")
     findings = [Finding("error", "", f"{problem}; what could be read is kept.") for problem in scan.problems]
     return BagIndex("mcap", joined(channels), (*findings, *other))
 
@@ -90,16 +108,48 @@ def _scan_records(file: int, file_bytes: int, scan: _McapScan) -> None:
                 _add_chunk(start[9:], content, content_bytes, scan)
             elif operation == _MESSAGE:
                 _add_loose(start[9:], position, scan.loose)
+            elif operation == _STATISTICS and len(start) >= 17:
+                (scan.stated_messages,) = struct.unpack_from("<Q", start, 9)
             elif operation in (_SCHEMA, _CHANNEL, _MESSAGE_INDEX):
                 if content_bytes > _MAX_SMALL_RECORD:
                     raise InputError(f"a record claims {content_bytes} bytes")
                 _add_small(operation, os.pread(file, content_bytes, content), scan)
+            if operation == _FOOTER:
+                _check_summary(file, position, start, content_bytes, scan)
         except InputError as error:
             scan.problems.append(f"The file is cut off or damaged at byte {position} ({error.cause})")
             return
         position = content + content_bytes
     if operation != _FOOTER:
         scan.problems.append("The file has no footer: it was not closed")
+
+
+def _check_summary(file: int, footer: int, start: bytes, content_bytes: int, scan: _McapScan) -> None:
+    """Compare the summary with its checksum; what a damaged one says of channels is forgotten."""
+    if content_bytes < 20 or len(start) < 29:
+        raise InputError("the footer is cut off")
+    summary, _, crc = struct.unpack_from("<QQI", start, 9)
+    if not crc or not summary or not 0 <= footer - summary <= _MAX_SMALL_RECORD:
+        return
+    if zlib.crc32(os.pread(file, footer - summary + 25, summary)) != crc:
+        scan.problems.append("The summary does not match its checksum")
+        scan.channels.clear()
+        scan.schemas.clear()
+
+
+def _check_plain_chunks(file: int, scan: _McapScan) -> None:
+    """Compare chunks that are not packed with their checksums, up to a total of bytes; packed ones are
+    compared when they are unpacked."""
+    budget = _CHECKED_BYTES
+    for row, chunk in enumerate(scan.chunks):
+        if chunk.compression != "none" or not chunk.crc:
+            continue
+        budget -= chunk.stored_bytes
+        if budget < 0:
+            return
+        if zlib.crc32(os.pread(file, chunk.stored_bytes, chunk.position)) != chunk.crc:
+            scan.suspect_chunks.add(row)
+            scan.problems.append(f"Chunk {row} does not match its checksum: some of its messages are damaged")
 
 
 def _record_head(start: bytes) -> tuple[int, int]:
@@ -115,7 +165,7 @@ def _add_chunk(start: bytes, content: int, stored_bytes: int, scan: _McapScan) -
     # start time, end time, unpacked size, crc, compression (string), packed size, records
     if len(start) < 32:
         raise InputError("a chunk is cut off")
-    unpacked, _, name_bytes = struct.unpack_from("<QII", start, 16)
+    unpacked, crc, name_bytes = struct.unpack_from("<QII", start, 16)
     if name_bytes > 8 or 40 + name_bytes > len(start):
         raise InputError("a chunk header is damaged")
     name = start[32 : 32 + name_bytes].decode("ascii", "replace")
@@ -123,7 +173,7 @@ def _add_chunk(start: bytes, content: int, stored_bytes: int, scan: _McapScan) -
     compression = _COMPRESSIONS.get(name, name)
     if compression == "none":
         unpacked = min(unpacked, stored_bytes - head)
-    scan.chunks.append(Chunk(content + head, stored_bytes - head, unpacked, compression))
+    scan.chunks.append(Chunk(content + head, stored_bytes - head, unpacked, compression, crc))
 
 
 def _add_loose(start: bytes, position: int, loose: dict[int, list[tuple[int, int]]]) -> None:
@@ -144,11 +194,20 @@ def _add_small(operation: int, content: bytes, scan: _McapScan) -> None:
             scan.channels[number] = _ChannelRecord(schema_id, topic, _string(content, end)[0])
         else:
             (index_bytes,) = struct.unpack_from("<I", content, 2)
-            if not scan.chunks or 6 + index_bytes != len(content) or index_bytes % _ENTRY.itemsize:
-                raise InputError("a message index is damaged")
-            entries = np.frombuffer(content, _ENTRY, offset=6)
-            scan.entries.setdefault(number, []).append((len(scan.chunks) - 1, entries))
-            scan.indexed_chunks.add(len(scan.chunks) - 1)
+            if not scan.chunks:
+                raise InputError("a message index stands before any chunk")
+            entries, row = np.empty(0, _ENTRY), len(scan.chunks) - 1
+            if 6 + index_bytes == len(content) and index_bytes % _ENTRY.itemsize == 0:
+                entries = np.frombuffer(content, _ENTRY, offset=6)
+            known = any(other == row for other, _ in scan.entries.get(number, [])[-1:])
+            if (
+                known
+                or (entries["offset"] >= scan.chunks[row].content_bytes).any()
+                or 6 + index_bytes != len(content)
+            ):
+                scan.suspect_chunks.add(row)
+            scan.entries.setdefault(number, []).append((row, entries))
+            scan.indexed_chunks.add(row)
     except struct.error as error:
         raise InputError("a record is cut off") from error
 
@@ -162,12 +221,19 @@ def _string(content: bytes, at: int) -> tuple[str, int]:
 
 def _complete_from_chunks(file: int, scan: _McapScan) -> None:
     """Walk through chunks that have no index, and those that hold channels not yet known."""
-    unknown = {rows[0][0] for channel, rows in scan.entries.items() if channel not in scan.channels}
-    for chunk_row in sorted((set(range(len(scan.chunks))) - scan.indexed_chunks) | unknown):
+    unknown = {row for c, parts in scan.entries.items() if c not in scan.channels for row, _ in parts}
+    rebuilt = scan.suspect_chunks | unknown
+    scan.indexed_chunks -= rebuilt
+    for channel, parts in scan.entries.items():
+        scan.entries[channel] = [part for part in parts if part[0] not in rebuilt]
+    lost = []
+    for chunk_row in sorted(set(range(len(scan.chunks))) - scan.indexed_chunks):
         try:
             _walk_chunk(read_chunk(file, scan.chunks[chunk_row]), chunk_row, scan)
         except InputError as error:
-            scan.problems.append(f"Chunk {chunk_row} is lost ({error.cause})")
+            lost.append(f"({chunk_row}: {error.cause.rstrip('.')})")
+    if lost:
+        scan.problems.append(f"{len(lost)} of {len(scan.chunks)} chunks are lost {lost[0]}")
 
 
 def _walk_chunk(content: bytes, chunk_row: int, scan: _McapScan) -> None:
@@ -192,19 +258,27 @@ def _walk_chunk(content: bytes, chunk_row: int, scan: _McapScan) -> None:
 
 
 def _channels(path: Path, scan: _McapScan) -> tuple[list[Channel], list[Finding]]:
-    channels, other = [], []
+    """One channel per topic, type and encoding, in the order of recording; and those of other encodings."""
+    other: list[Finding] = []
+    groups: dict[tuple[str, str, Encoding], list[int]] = {}
     for number, (schema_id, topic, encoding_name) in scan.channels.items():
         encoding = _ENCODINGS.get(encoding_name)
         if encoding is None:
-            message = f"{topic}: messages are encoded as {encoding_name!r}, not as ROS messages; left out."
-            other.append(Finding("note", topic, message))
+            words = f"messages are encoded as {printable(encoding_name)!r}, not as ROS messages; left out."
+            other.append(Finding("note", printable(topic), f"{printable(topic)}: {words}"))
             continue
-        parts = sorted(scan.entries.get(number, []), key=lambda part: part[0])
-        entries = np.concatenate([np.empty(0, _ENTRY), *(part for _, part in parts)])
-        chunk_rows = np.repeat([row for row, _ in parts], [len(part) for _, part in parts]).astype(np.int32)
-        offsets = np.minimum(entries["offset"], 2**62).astype(np.int64)  # a damaged one points nowhere
-        payloads = ChunkedPayloads(path, "mcap", tuple(scan.chunks), chunk_rows, offsets)
-        stamps = np.minimum(entries["time"], 2**62).astype(np.int64)
         message_type = standard_type_name(scan.schemas.get(schema_id, ""))
+        if schema_id not in scan.schemas:
+            words = f"{printable(topic)}: what type its messages are is missing from the file; left out."
+            other.append(Finding("error", printable(topic), words))
+        groups.setdefault((topic, message_type, encoding), []).append(number)
+    channels = []
+    for (topic, message_type, encoding), numbers in groups.items():
+        found = [(owner, row, e) for owner in numbers for row, e in scan.entries.get(owner, [])]
+        entries = np.concatenate([np.empty(0, _ENTRY), *(part for _, _, part in found)])
+        # a damaged offset points nowhere
+        parts = [(owner, row, np.minimum(e["offset"], 2**62).astype(np.int64)) for owner, row, e in found]
+        times_ns = np.minimum(entries["time"], 2**62).astype(np.int64)
+        stamps, payloads = payloads_in_order(path, "mcap", scan.chunks, parts, times_ns)
         channels.append(Channel(topic, message_type, encoding, stamps, payloads))
     return channels, other

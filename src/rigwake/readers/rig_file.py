@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,11 @@ def read_rig_file(path: Path) -> tuple[dict[str, CameraModel], Rig | None]:
     `translation_m`), `cameras.NAME.time_offset_s`, `antenna_rig_m`, `rig_from_imu`. Raises InputError.
     """
     content = read_yaml_settings(path)
+    return rig_from_mapping(content, str(path))
+
+
+def rig_from_mapping(content: Mapping[str, Any], path: str) -> tuple[dict[str, CameraModel], Rig | None]:
+    """The same from plain values; path names them in errors."""
     try:
         described = {str(name): dict(entry or {}) for name, entry in dict(content["cameras"]).items()}
         lenses = {n: e if "params" in e else e.get("camera") for n, e in described.items()}

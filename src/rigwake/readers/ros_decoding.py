@@ -7,6 +7,7 @@ code, and a topic whose definition differs from the standard is refused by its d
 from __future__ import annotations
 
 import struct
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from typing import Any, NamedTuple
@@ -18,11 +19,15 @@ from rosbags.typesys.store import Typestore
 
 from rigwake._types import Array, Stamps
 from rigwake.errors import InputError
-from rigwake.readers.channels import Channel, Encoding
+from rigwake.readers.channels import MAX_MESSAGE_BYTES, Channel, Encoding, standard_type_name
+from rigwake.readers.printable import printable
 from rigwake.recording import Finding
 
 HEADER_BYTES = 256
 """Enough of a message to read its stamp and frame."""
+
+MAX_SENSOR_BYTES = 2**14
+"""A message of a sensor other than a camera that is larger is damage."""
 
 
 @cache
@@ -37,12 +42,32 @@ def typestore(encoding: Encoding) -> Typestore:
 
 def has_standard_type(channel: Channel) -> bool:
     """Whether the type is a standard one and, where the bag tells, defined as in the standard."""
-    store = typestore(channel.encoding)
-    if channel.message_type not in store.fielddefs:
+    return is_standard_type(channel.message_type, channel.type_digest, channel.encoding)
+
+
+def is_standard_type(message_type: str, digest: str = "", encoding: Encoding = "ros1") -> bool:
+    """The same of a type's name, and the md5 of its definition where that is known."""
+    store, name = typestore(encoding), standard_type_name(message_type)
+    if name not in store.fielddefs:
         return False
-    if channel.encoding != "ros1" or channel.type_digest in ("", "*"):
+    if encoding != "ros1" or digest in ("", "*"):
         return True
-    return store.generate_msgdef(channel.message_type)[1] == channel.type_digest
+    return store.generate_msgdef(name)[1] == digest
+
+
+@cache
+def _types_by_digest() -> dict[str, str]:
+    store = typestore("ros1")
+    packages = ("sensor_msgs/", "tf2_msgs/", "nav_msgs/", "geometry_msgs/")
+    names = [name for name in store.fielddefs if name.startswith(packages)]
+    digests = [store.generate_msgdef(name)[1] for name in names]
+    counts = Counter(digests)
+    return {digest: name for name, digest in zip(names, digests, strict=True) if counts[digest] == 1}
+
+
+def type_of_digest(digest: str) -> str | None:
+    """The standard message of this md5 sum of its definition, if it is the only one (ROS 1)."""
+    return _types_by_digest().get(digest)
 
 
 def decode(payload: bytes, message_type: str, encoding: Encoding) -> Any:
@@ -56,9 +81,9 @@ def decode(payload: bytes, message_type: str, encoding: Encoding) -> Any:
         raise InputError(f"A {message_type} is damaged ({error}).") from error
 
 
-def decode_all(channel: Channel) -> Iterator[tuple[int, Any]]:
-    """Row and message of every message of the channel that can be decoded."""
-    for row, payload in enumerate(channel.payloads.read(range(len(channel)))):
+def decode_all(channel: Channel, limit_bytes: int = MAX_MESSAGE_BYTES) -> Iterator[tuple[int, Any]]:
+    """Row and message of every message of the channel that can be decoded; one that is longer cannot."""
+    for row, payload in enumerate(channel.payloads.read(range(len(channel)), limit_bytes)):
         try:
             yield row, decode(payload, channel.message_type, channel.encoding)
         except InputError:
@@ -87,7 +112,8 @@ def read_header(payload: bytes, encoding: Encoding) -> Header | None:
         return None
     if end > len(payload) or nanoseconds >= 10**9:
         return None
-    return Header(seconds * 10**9 + nanoseconds, frame.rstrip(b"\0").decode("utf-8", "replace"), end)
+    name = printable(frame.rstrip(b"\0").decode("utf-8", "replace"))
+    return Header(seconds * 10**9 + nanoseconds, name.lstrip("/"), end)  # tf2 knows no leading slash
 
 
 class StampedRows(NamedTuple):
@@ -126,6 +152,12 @@ def stamped_rows(sensor: str, channel: Channel, payloads: Iterable[bytes] | None
         )
     frame = next((header.frame_id for header in headers if header is not None), "")
     return StampedRows(rows, stamps, frame, tuple(findings))
+
+
+def whole_payloads(channel: Channel) -> list[bytes]:
+    """All messages of a sensor; one of `MAX_SENSOR_BYTES` or more is damage, and empty."""
+    payloads = channel.payloads.read(range(len(channel)), MAX_SENSOR_BYTES)
+    return [payload if len(payload) < MAX_SENSOR_BYTES else b"" for payload in payloads]
 
 
 def trailing_doubles(payloads: Sequence[bytes], count: int, encoding: Encoding) -> Array:

@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
-from rigwake.cameras.formats.camera_info import camera_from_info
-from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import CameraError, InputError, UsageError
 from rigwake.geometry.se3 import SE3
+from rigwake.readers.camera_info_choice import INFO, MAX_INFO_BYTES
 from rigwake.readers.channels import BagIndex, Channel, HeldPayloads
 from rigwake.readers.chunks import ChunkedPayloads, read_together
-from rigwake.readers.images import ImageSize
-from rigwake.readers.ros_decoding import HEADER_BYTES, decode_all, has_standard_type, stamped_rows
-from rigwake.readers.ros_frames import COMPRESSED, IMAGE_TYPES, RosFrames, first_image_size
-from rigwake.readers.ros_sensors import FIX, IMU, POSE_TYPES, read_fix, read_imu, read_poses
-from rigwake.readers.ros_transforms import TF_TYPES, read_moving, read_static
-from rigwake.readers.streams import time_order
-from rigwake.readers.topics import TopicMap, camera_base, sensor_names
+from rigwake.readers.printable import printable
+from rigwake.readers.rig_description import (
+    MAX_TEXT_BYTES,
+    RIG_TOPIC,
+    TRUTH_PREFIX,
+    RigDescription,
+    description_of_text,
+    with_description,
+)
+from rigwake.readers.ros_cameras import read_cameras_of_bag
+from rigwake.readers.ros_decoding import HEADER_BYTES, MAX_SENSOR_BYTES, decode_all, has_standard_type
+from rigwake.readers.ros_frames import IMAGE_TYPES
+from rigwake.readers.ros_imus import IMU, read_imus
+from rigwake.readers.ros_sensors import (
+    FIX,
+    POSE_TYPES,
+    VELOCITY_TYPES,
+    read_fix,
+    read_poses,
+    with_velocity,
+)
+from rigwake.readers.ros_transforms import MAX_TF_BYTES, TF_TYPES, read_transforms
+from rigwake.readers.topics import TopicMap, distinct_names, sensor_names
 from rigwake.recording import (
     AttitudeStream,
     CameraStream,
@@ -30,10 +44,9 @@ from rigwake.recording import (
 )
 from rigwake.trajectory import Trajectory
 
-_INFO = "sensor_msgs/msg/CameraInfo"
-MAX_SENSOR_BYTES = 2**20
-"""A message of a sensor other than a camera that is larger is damage."""
+_STRING = "std_msgs/msg/String"
 _ROLE_TYPES = {"camera": IMAGE_TYPES, "imu": {IMU}, "gnss": {FIX}, "pose": POSE_TYPES}
+_UNDERSTOOD = frozenset().union(*_ROLE_TYPES.values(), {INFO}, TF_TYPES, VELOCITY_TYPES)
 
 
 @dataclass
@@ -45,6 +58,7 @@ class _RosStreams:
     gnss: dict[str, GnssStream] = field(default_factory=dict)
     attitudes: dict[str, AttitudeStream] = field(default_factory=dict)
     poses: dict[str, Trajectory] = field(default_factory=dict)
+    truth: dict[str, Trajectory] = field(default_factory=dict)
     static_transforms: dict[tuple[str, str], SE3] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
     headers: dict[str, list[bytes]] = field(default_factory=dict)
@@ -55,27 +69,29 @@ def recording_from_bag(path: Path, bag: BagIndex, topics: TopicMap) -> Recording
 
     Raises UsageError if `topics` names one that is not there or has a wrong type.
     """
-    found = _RosStreams(findings=list(bag.findings))
-    usable = {c.topic: c for c in bag.channels if len(c) and has_standard_type(c)}
-    for channel in bag.channels:
-        if channel.topic not in usable and len(channel) and channel.message_type in _all_types():
-            message = f"{channel.topic}: {channel.message_type} is not the standard message; it is left out."
-            found.findings.append(Finding("warning", channel.topic, message))
-    usable = _held_where_packed(usable, found)
-    readers: Mapping[str, Callable[[str, Channel], None]] = {
-        "camera": lambda name, channel: _add_camera(name, channel, usable, found),
-        "imu": lambda name, channel: _add_imu(name, channel, found),
-        "gnss": lambda name, channel: _add_fix(name, channel, found),
-        "pose": lambda name, channel: _add_poses(name, channel, found),
-    }
-    _add_transforms(list(usable.values()), found)
-    for role, add in readers.items():
-        for name, channel in _channels_of(role, usable, topics).items():
-            try:
-                add(name, channel)
-            except (InputError, CameraError) as error:
-                found.findings.append(Finding("error", name, f"left out: {error.cause}"))
-    return Recording(
+    found = _RosStreams(
+        findings=[replace(f, sensor=printable(f.sensor), message=printable(f.message)) for f in bag.findings]
+    )
+    usable = _held_where_packed(_usable_channels(bag, found), found)
+    description = _description_inside(usable, found)
+    truth = {topic: c for topic, c in usable.items() if topic.startswith(TRUTH_PREFIX)}
+    usable = {topic: c for topic, c in usable.items() if topic not in truth}
+    chosen = {role: _channels_of(role, usable, topics, description) for role in _ROLE_TYPES}
+    moving, found.static_transforms, findings = read_transforms(usable.values())
+    found.poses |= moving
+    found.cameras, camera_findings = read_cameras_of_bag(usable, found.headers, topics, description)
+    found.imus, found.attitudes, imu_findings = read_imus(chosen["imu"], found.static_transforms)
+    found.findings += [*findings, *camera_findings, *imu_findings]
+    for name, channel in chosen["gnss"].items():
+        _try(name, channel, found, _add_fix)
+    found.gnss = {name: with_velocity(fixes, usable) for name, fixes in found.gnss.items()}
+    for name, channel in chosen["pose"].items():
+        _try(name, channel, found, _add_poses)
+    for topic, channel in truth.items():
+        _try(
+            description.name_of("truth", topic, topic.removeprefix(TRUTH_PREFIX)), channel, found, _add_truth
+        )
+    recording = Recording(
         path,
         bag.kind,
         found.cameras,
@@ -84,41 +100,117 @@ def recording_from_bag(path: Path, bag: BagIndex, topics: TopicMap) -> Recording
         found.attitudes,
         found.poses,
         found.static_transforms,
+        true_trajectories=found.truth,
         findings=tuple(found.findings),
     )
+    return with_description(recording, description)
+
+
+def _description_inside(usable: Mapping[str, Channel], found: _RosStreams) -> RigDescription:
+    """What a bag that rigwake wrote says of itself."""
+    channel = usable.get(RIG_TOPIC)
+    if channel is None or channel.message_type != _STRING:
+        return RigDescription()
+    for _, message in decode_all(channel, MAX_TEXT_BYTES):
+        try:
+            return description_of_text(message.data)
+        except InputError as error:
+            found.findings.append(Finding("warning", RIG_TOPIC, error.cause))
+    return RigDescription()
+
+
+def _try(
+    name: str, channel: Channel, found: _RosStreams, add: Callable[[str, Channel, _RosStreams], None]
+) -> None:
+    try:
+        add(name, channel, found)
+    except (InputError, CameraError) as error:
+        found.findings.append(Finding("error", name, f"left out: {error.cause}"))
+
+
+def _usable_channels(bag: BagIndex, found: _RosStreams) -> dict[str, Channel]:
+    """By topic, those that hold messages of a standard type. Of a topic with several types that are understood
+    the one with the most messages; the others are named."""
+    usable: dict[str, Channel] = {}
+    for given in bag.channels:
+        channel = replace(given, topic=printable(given.topic), message_type=printable(given.message_type))
+        topic = channel.topic
+        if not len(channel):
+            continue
+        if not has_standard_type(channel):
+            if any(_resembles(channel.message_type, known) for known in _UNDERSTOOD):
+                message = f"{topic}: {channel.message_type} is not the standard message; it is left out."
+                found.findings.append(Finding("warning", topic, message))
+            continue
+        other = usable.get(topic)
+        if other is None:
+            usable[topic] = channel
+            continue
+        kept, dropped = (channel, other) if _weight(channel) > _weight(other) else (other, channel)
+        usable[topic] = kept
+        if dropped.message_type in _UNDERSTOOD:
+            message = (
+                f"{topic} holds messages of two types: the {len(kept)} {kept.message_type} are used, the "
+                f"{len(dropped)} {dropped.message_type} are left out."
+            )
+            found.findings.append(Finding("warning", topic, message))
+    return usable
+
+
+def _resembles(message_type: str, known: str) -> bool:
+    """Whether a type is this one but for two letters, or cut off: then its name was damaged."""
+    if 4 < len(message_type) < len(known) and known.startswith(message_type):
+        return True
+    different = sum(a != b for a, b in zip(message_type, known, strict=False))
+    return different <= 2 and abs(len(message_type) - len(known)) <= 2
+
+
+def _weight(channel: Channel) -> tuple[bool, int]:
+    return channel.message_type in _UNDERSTOOD, len(channel)
 
 
 def _held_where_packed(usable: Mapping[str, Channel], found: _RosStreams) -> dict[str, Channel]:
     """Of a packed bag all messages but images, and the headers of images, read in one pass over its chunks."""
-    packed = {
-        topic: channel.payloads
-        for topic, channel in usable.items()
-        if isinstance(channel.payloads, ChunkedPayloads) and channel.payloads.is_packed
-    }
-    are_images = {topic: usable[topic].message_type in IMAGE_TYPES for topic in packed}
-    understood = [t for t in packed if usable[t].message_type in _all_types() | {_INFO} | TF_TYPES]
-    wanted = [(packed[t], HEADER_BYTES if are_images[t] else MAX_SENSOR_BYTES) for t in understood]
+    packed: dict[Path, list[tuple[str, ChunkedPayloads]]] = {}
+    for topic, channel in usable.items():
+        payloads = channel.payloads
+        if (
+            isinstance(payloads, ChunkedPayloads)
+            and payloads.is_packed
+            and channel.message_type in _UNDERSTOOD
+        ):
+            packed.setdefault(payloads.path, []).append((topic, payloads))
     held = dict(usable)
-    for topic, messages in zip(understood, read_together(wanted), strict=True):
-        if are_images[topic]:
-            found.headers[topic] = messages
-        else:
-            held[topic] = replace(usable[topic], payloads=HeldPayloads(messages))
+    for members in packed.values():
+        wanted = [(payloads, _limit_bytes(usable[topic])) for topic, payloads in members]
+        for (topic, _), messages in zip(members, read_together(wanted), strict=True):
+            if usable[topic].message_type in IMAGE_TYPES:
+                found.headers[topic] = messages
+            else:
+                held[topic] = replace(usable[topic], payloads=HeldPayloads(messages))
     return held
 
 
-def _all_types() -> set[str]:
-    return {message_type for types in _ROLE_TYPES.values() for message_type in types}
+def _limit_bytes(channel: Channel) -> int:
+    """More of a message of this type is not held in memory."""
+    if channel.message_type in IMAGE_TYPES:
+        return HEADER_BYTES
+    if channel.message_type in (INFO, _STRING):
+        return MAX_INFO_BYTES if channel.message_type == INFO else MAX_TEXT_BYTES
+    return MAX_TF_BYTES if channel.message_type in TF_TYPES else MAX_SENSOR_BYTES
 
 
-def _channels_of(role: str, usable: Mapping[str, Channel], topics: TopicMap) -> dict[str, Channel]:
+def _channels_of(
+    role: str, usable: Mapping[str, Channel], topics: TopicMap, description: RigDescription
+) -> dict[str, Channel]:
     types = _ROLE_TYPES[role]
     candidates = {topic: c for topic, c in usable.items() if c.message_type in types}
     chosen = topics.chosen(role)
     if chosen is None:
-        if role == "camera":
-            candidates = _one_topic_per_camera(candidates)
-        names = sensor_names(list(candidates), role)
+        given = sensor_names(list(candidates), role)
+        if role == "imu":  # an attitude without rates travels as the same type
+            given = {topic: description.name_of("attitude", topic, name) for topic, name in given.items()}
+        names = distinct_names({topic: description.name_of(role, topic, n) for topic, n in given.items()})
         return {names[topic]: channel for topic, channel in candidates.items()}
     missing = [topic for topic in chosen.values() if topic not in candidates]
     if missing:
@@ -129,92 +221,16 @@ def _channels_of(role: str, usable: Mapping[str, Channel], topics: TopicMap) -> 
     return {name: candidates[topic] for name, topic in chosen.items()}
 
 
-def _one_topic_per_camera(images: Mapping[str, Channel]) -> dict[str, Channel]:
-    """Of several image topics of one camera (raw, compressed, rectified) the fullest, then the least treated."""
-    groups: dict[str, list[Channel]] = {}
-    for topic, channel in images.items():
-        if "depth" not in topic.lower().split("/")[-1]:
-            groups.setdefault(camera_base(topic), []).append(channel)
-
-    def preference(channel: Channel) -> tuple[int, bool, bool, str]:
-        rectified = "rect" in channel.topic
-        return (-len(channel), rectified, channel.message_type == COMPRESSED, channel.topic)
-
-    best = [min(group, key=preference) for group in groups.values()]
-    return {channel.topic: channel for channel in sorted(best, key=lambda c: c.topic)}
-
-
-def _add_camera(name: str, channel: Channel, usable: Mapping[str, Channel], found: _RosStreams) -> None:
-    stamped = stamped_rows(name, channel, found.headers.get(channel.topic))
-    order, repaired = time_order(name, stamped.timestamps_ns)
-    if not len(order):
-        raise InputError(f"{channel.topic} has no readable message.")
-    rows, stamps = stamped.rows[order], stamped.timestamps_ns[order]
-    size = first_image_size(channel, rows)
-    model, remark = _camera_model(name, channel, usable, size)
-    found.findings += [*stamped.findings, *repaired, *remark]
-    found.cameras[name] = CameraStream(
-        name,
-        stamps,
-        RosFrames(channel, rows, stamps, size),
-        size.width_px,
-        size.height_px,
-        model,
-        channel.topic,
-        stamped.frame_id,
-    )
-
-
-def _camera_model(
-    name: str, channel: Channel, usable: Mapping[str, Channel], size: ImageSize
-) -> tuple[CameraModel | None, Sequence[Finding]]:
-    topic = f"{camera_base(channel.topic)}/camera_info"
-    infos = usable.get(topic)
-    if infos is None or infos.message_type != _INFO:
-        message = f"no camera_info (looked for {topic}): intrinsics must be given."
-        return None, [Finding("warning", name, message)]
-    for _, info in decode_all(infos):
-        return model_from_info(name, info, size)
-    return None, [Finding("warning", name, f"no message of {topic} can be read.")]
-
-
-def model_from_info(name: str, info: Any, size: ImageSize) -> tuple[CameraModel | None, Sequence[Finding]]:
-    """The lens of a CameraInfo message (ROS 1 or 2), or None and why the message cannot be used."""
-    if (info.width, info.height) not in ((0, 0), size):
-        message = (
-            f"camera_info is for {info.width} x {info.height}, images are {size.width_px} x {size.height_px}: "
-            "its intrinsics are not used."
-        )
-        return None, [Finding("error", name, message)]
-    D, K = (info.D, info.K) if hasattr(info, "D") else (info.d, info.k)  # capitals in ROS 1 only
-    try:
-        return camera_from_info(info.distortion_model, D, K, *size), []
-    except CameraError as error:
-        return None, [Finding("warning", name, f"camera_info is not usable: {error.cause}")]
-
-
-def _add_imu(name: str, channel: Channel, found: _RosStreams) -> None:
-    stream, attitude, findings = read_imu(name, channel)
-    found.imus[name] = stream
-    if attitude is not None:
-        found.attitudes[name] = attitude
-    found.findings += findings
-
-
 def _add_fix(name: str, channel: Channel, found: _RosStreams) -> None:
     found.gnss[name], findings = read_fix(name, channel)
     found.findings += findings
 
 
-def _add_transforms(channels: Sequence[Channel], found: _RosStreams) -> None:
-    static = [c for c in channels if c.message_type in TF_TYPES and c.topic.endswith("tf_static")]
-    moving = [c for c in channels if c.message_type in TF_TYPES and not c.topic.endswith("tf_static")]
-    transforms, findings = read_static(static)
-    found.poses, never_moving, moving_findings = read_moving(moving)
-    found.static_transforms = never_moving | transforms
-    found.findings += [*findings, *moving_findings]
-
-
 def _add_poses(name: str, channel: Channel, found: _RosStreams) -> None:
     found.poses[name], findings = read_poses(name, channel)
+    found.findings += findings
+
+
+def _add_truth(name: str, channel: Channel, found: _RosStreams) -> None:
+    found.truth[name], findings = read_poses(name, channel)
     found.findings += findings

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake.errors import InputError
-from rigwake.readers.channels import BagIndex, Channel, joined, standard_type_name
-from rigwake.readers.chunks import Chunk, ChunkedPayloads, read_chunk
+from rigwake.readers.channels import BagIndex, Channel, joined, require_regular_file, standard_type_name
+from rigwake.readers.chunks import Chunk, payloads_in_order, read_chunk, within_budget
+from rigwake.readers.ros_decoding import is_standard_type, type_of_digest
 from rigwake.recording import Finding
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -54,24 +55,32 @@ class _BagScan:
     connections: dict[int, tuple[str, str, str]] = field(default_factory=dict)
     entries: dict[int, list[tuple[int, NDArray[np.void]]]] = field(default_factory=dict)
     indexed_chunks: set[int] = field(default_factory=set)
+    suspect_chunks: set[int] = field(default_factory=set)
+    """Chunks whose index contradicts itself or the chunk: they are walked through instead."""
     problems: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
 
 
 def index_rosbag1(path: Path) -> BagIndex:
     """Index a ROS 1 bag; damage is reported in `findings`. InputError if it is no such bag or encrypted."""
+    require_regular_file(path)
     file = os.open(path, os.O_RDONLY)
     try:
         if os.pread(file, len(MAGIC), 0) != MAGIC:
             raise InputError(f"{path.name} is not a ROS 1 bag of format 2.0.")
         scan = _BagScan()
         _scan_records(file, os.fstat(file).st_size, scan)
+        scan.chunks, refused = within_budget(scan.chunks)
+        if refused:
+            scan.problems.append(f"{refused} chunks claim to hold far more than the file can pack")
         _complete_from_chunks(file, scan)
     finally:
         os.close(file)
     findings = tuple(
         Finding("error", "", f"{problem}; what could be read is kept.") for problem in scan.problems
     )
-    return BagIndex("ros1 bag", joined(_channels(path, scan)), findings)
+    remarks = tuple(Finding("note", "", f"{remark}.") for remark in scan.remarks)
+    return BagIndex("ros1 bag", joined(_channels(path, scan)), (*findings, *remarks))
 
 
 def _scan_records(file: int, file_bytes: int, scan: _BagScan) -> None:
@@ -139,32 +148,67 @@ def _add_chunk(record: Record, stored_bytes: int, scan: _BagScan) -> None:
 def _add_index(file: int, record: Record, scan: _BagScan) -> None:
     if not scan.chunks:
         raise InputError("an index stands before any chunk")
-    count = record.number("count", "<I")
-    if count * _ENTRY.itemsize != record.data_bytes:
-        raise InputError("an index has a wrong length")
-    entries = np.frombuffer(os.pread(file, record.data_bytes, record.data_position), _ENTRY)
     chunk_row = len(scan.chunks) - 1
-    scan.entries.setdefault(record.number("conn", "<I"), []).append((chunk_row, entries))
+    try:
+        connection, count = record.number("conn", "<I"), record.number("count", "<I")
+    except InputError:
+        connection, count = -1, -1
+    entries = np.empty(0, _ENTRY)
+    if count * _ENTRY.itemsize == record.data_bytes:
+        entries = np.frombuffer(os.pread(file, record.data_bytes, record.data_position), _ENTRY)
+    known = any(row == chunk_row for row, _ in scan.entries.get(connection, [])[-1:])
+    past_end = (entries["offset"] >= scan.chunks[chunk_row].content_bytes).any()
+    if known or past_end or not len(entries):
+        scan.suspect_chunks.add(chunk_row)
+    scan.entries.setdefault(connection, []).append((chunk_row, entries))
     scan.indexed_chunks.add(chunk_row)
 
 
 def _add_connection(details: bytes, record: Record, scan: _BagScan) -> None:
+    """A connection's topic, type and digest. They stand twice in a bag: where those differ one is damaged."""
     fields = parse_fields(details)
     texts = [
         raw.decode("utf-8", "replace")
         for raw in (record.fields.get("topic", b""), fields.get("type", b""), fields.get("md5sum", b""))
     ]
-    scan.connections[record.number("conn", "<I")] = (texts[0], texts[1], texts[2])
+    inner = fields.get("topic", record.fields.get("topic", b"")).decode("utf-8", "replace")
+    if inner != texts[0] and record.number("conn", "<I") not in scan.connections:
+        # the name after remapping may differ from the one that was advertised: worth a word, not an error
+        scan.remarks.append(f"A connection of {texts[0]} calls itself {inner}")
+    by_digest = type_of_digest(texts[2])
+    if by_digest is not None and not is_standard_type(texts[1]):
+        scan.problems.append(
+            f"{texts[0]}: the type {texts[1]} is not known, but has the checksum of {by_digest}"
+        )
+        texts[1] = by_digest
+    number, described = record.number("conn", "<I"), (texts[0], texts[1], texts[2])
+    former = scan.connections.setdefault(number, described)
+    if former != described:
+        problem = (
+            f"A connection is described as {former[0]} ({former[1]}) and as {described[0]} ({described[1]})"
+        )
+        scan.problems.append(problem)
+        if is_standard_type(described[1], described[2]) and not is_standard_type(former[1], former[2]):
+            scan.connections[number] = described
 
 
 def _complete_from_chunks(file: int, scan: _BagScan) -> None:
     """Walk through chunks that have no index, and those that hold connections not yet known."""
-    unknown = {rows[0][0] for conn, rows in scan.entries.items() if conn not in scan.connections}
-    for chunk_row in sorted((set(range(len(scan.chunks))) - scan.indexed_chunks) | unknown):
+    unknown = {row for c, parts in scan.entries.items() if c not in scan.connections for row, _ in parts}
+    rebuilt = scan.suspect_chunks | unknown
+    scan.indexed_chunks -= rebuilt
+    for connection, parts in scan.entries.items():
+        scan.entries[connection] = [part for part in parts if part[0] not in rebuilt]
+    lost = []
+    for chunk_row in sorted(set(range(len(scan.chunks))) - scan.indexed_chunks):
         try:
             _walk_chunk(read_chunk(file, scan.chunks[chunk_row]), chunk_row, scan)
         except InputError as error:
-            scan.problems.append(f"Chunk {chunk_row} is lost ({error.cause})")
+            lost.append(f"({chunk_row}: {error.cause.rstrip('.')})")
+    if lost:
+        scan.problems.append(f"{len(lost)} of {len(scan.chunks)} chunks are lost {lost[0]}")
+    if scan.suspect_chunks:
+        scan.problems.append(f"The index of {len(scan.suspect_chunks)} chunks is damaged")
 
 
 def _walk_chunk(content: bytes, chunk_row: int, scan: _BagScan) -> None:
@@ -191,15 +235,16 @@ def _walk_chunk(content: bytes, chunk_row: int, scan: _BagScan) -> None:
 
 
 def _channels(path: Path, scan: _BagScan) -> list[Channel]:
+    """One channel per topic and type, whatever the number of publishers, in the order of recording."""
+    groups: dict[tuple[str, str, str], list[int]] = {}
+    for connection, described in scan.connections.items():
+        groups.setdefault(described, []).append(connection)
     channels = []
-    for connection, (topic, message_type, digest) in scan.connections.items():
-        parts = sorted(scan.entries.get(connection, []), key=lambda part: part[0])
-        entries = np.concatenate([np.empty(0, _ENTRY), *(part for _, part in parts)])
-        chunk_rows = np.repeat([row for row, _ in parts], [len(part) for _, part in parts]).astype(np.int32)
-        payloads = ChunkedPayloads(
-            path, "ros1", tuple(scan.chunks), chunk_rows, entries["offset"].astype(np.int64)
-        )
-        stamps = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
-        type_name = standard_type_name(message_type)
-        channels.append(Channel(topic, type_name, "ros1", stamps, payloads, digest))
+    for (topic, message_type, digest), connections in groups.items():
+        found = [(owner, row, e) for owner in connections for row, e in scan.entries.get(owner, [])]
+        entries = np.concatenate([np.empty(0, _ENTRY), *(part for _, _, part in found)])
+        parts = [(owner, row, part["offset"].astype(np.int64)) for owner, row, part in found]
+        times_ns = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
+        stamps, payloads = payloads_in_order(path, "ros1", scan.chunks, parts, times_ns)
+        channels.append(Channel(topic, standard_type_name(message_type), "ros1", stamps, payloads, digest))
     return channels

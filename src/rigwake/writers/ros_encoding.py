@@ -5,33 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 
 from rigwake._types import Array, Image
 from rigwake.cameras.formats.camera_info import CameraInfo
-from rigwake.errors import InputError
 from rigwake.geometry import so3
 from rigwake.geometry.geodesy import lla_from_enu
 from rigwake.geometry.se3 import SE3
 from rigwake.readers.channels import Encoding
+from rigwake.readers.images import image_kind
 from rigwake.readers.ros_decoding import typestore
 from rigwake.recording import AttitudeStream, GnssStream, ImuStream
 
 _ABSENT = np.array([-1.0, *[0.0] * 8])  # REP-145: this orientation is not measured
 _COVARIANCE_KNOWN = 3
-
-
-def encode_image(image: Image, encoding: str) -> bytes:
-    """JPEG (quality 95) or PNG bytes; InputError if the image cannot be encoded."""
-    suffix, options = {
-        "jpeg": (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 95]),
-        "png": (".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]),
-    }[encoding]
-    worked, encoded = cv2.imencode(suffix, image, options)
-    if not worked:
-        raise InputError(f"An image of shape {image.shape} cannot be encoded as {encoding}.")
-    return encoded.tobytes()
 
 
 @dataclass(frozen=True)
@@ -63,26 +50,26 @@ class MessageFactory:
         w, x, y, z = (float(value) for value in quat_wxyz)
         return self._make("geometry_msgs/msg/Quaternion", x, y, z, w)
 
-    def image(self, timestamp_ns: int, frame_id: str, image: Image, image_encoding: str) -> bytes:
-        """A sensor_msgs Image (`raw`) or CompressedImage (`jpeg`, `png`)."""
-        header = self._header(timestamp_ns, frame_id)
-        if image_encoding != "raw":
-            encoded = np.frombuffer(encode_image(image, image_encoding), np.uint8)
-            name = "sensor_msgs/msg/CompressedImage"
-            return self.serialised(name, self._make(name, header, image_encoding, encoded))
+    def raw_image(self, timestamp_ns: int, frame_id: str, image: Image) -> bytes:
+        """A sensor_msgs/Image, mono8 or bgr8."""
         height_px, width_px = image.shape[:2]
         layout, channels = ("mono8", 1) if image.ndim == 2 else ("bgr8", 3)
         name = "sensor_msgs/msg/Image"
-        fields = (
-            header,
-            height_px,
-            width_px,
-            layout,
-            0,
-            width_px * channels,
-            np.ascontiguousarray(image).ravel(),
-        )
+        header = self._header(timestamp_ns, frame_id)
+        pixels = np.ascontiguousarray(image).ravel()
+        fields = (header, height_px, width_px, layout, 0, width_px * channels, pixels)
         return self.serialised(name, self._make(name, *fields))
+
+    def encoded_image(self, timestamp_ns: int, frame_id: str, encoded: bytes) -> bytes:
+        """A sensor_msgs/CompressedImage of JPEG or PNG bytes."""
+        name, layout = "sensor_msgs/msg/CompressedImage", image_kind(encoded)
+        header = self._header(timestamp_ns, frame_id)
+        return self.serialised(name, self._make(name, header, layout, np.frombuffer(encoded, np.uint8)))
+
+    def text(self, text: str) -> bytes:
+        """A std_msgs/String."""
+        name = "std_msgs/msg/String"
+        return self.serialised(name, self._make(name, text))
 
     def camera_info(self, timestamp_ns: int, frame_id: str, info: CameraInfo) -> bytes:
         """A sensor_msgs/CameraInfo without rectification."""
@@ -108,6 +95,25 @@ class MessageFactory:
 
     def imu(self, imu: ImuStream, row: int, attitude: AttitudeStream | None) -> bytes:
         """A sensor_msgs/Imu, with orientation if an attitude of the same rows is given."""
+        measured = (imu.gyro[row], np.zeros(9), imu.accel[row], np.zeros(9))
+        return self._imu(int(imu.timestamps_ns[row]), imu.frame_id, attitude, row, *measured)
+
+    def attitude(self, attitude: AttitudeStream, row: int) -> bytes:
+        """A sensor_msgs/Imu that says of rates and accelerations that they are not measured (REP-145)."""
+        absent = (np.zeros(3), _ABSENT, np.zeros(3), _ABSENT)
+        return self._imu(int(attitude.timestamps_ns[row]), attitude.frame_id, attitude, row, *absent)
+
+    def _imu(
+        self,
+        timestamp_ns: int,
+        frame_id: str,
+        attitude: AttitudeStream | None,
+        row: int,
+        gyro: Array,
+        gyro_cov: Array,
+        accel: Array,
+        accel_cov: Array,
+    ) -> bytes:
         quat_wxyz, orientation_cov = np.array([1.0, 0, 0, 0]), _ABSENT
         if attitude is not None:
             R = attitude.world_from_body[row]
@@ -116,15 +122,24 @@ class MessageFactory:
         name = "sensor_msgs/msg/Imu"
         message = self._make(
             name,
-            self._header(int(imu.timestamps_ns[row]), imu.frame_id),
+            self._header(timestamp_ns, frame_id),
             self._quaternion(quat_wxyz),
             orientation_cov,
-            self._vector("Vector3", imu.gyro[row]),
-            np.zeros(9),
-            self._vector("Vector3", imu.accel[row]),
-            np.zeros(9),
+            self._vector("Vector3", gyro),
+            gyro_cov,
+            self._vector("Vector3", accel),
+            accel_cov,
         )
         return self.serialised(name, message)
+
+    def velocity(self, gnss: GnssStream, row: int) -> bytes:
+        """A geometry_msgs/TwistStamped of a receiver's velocity (east, north, up)."""
+        assert gnss.velocity_enu is not None
+        name, inner = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
+        linear = self._vector("Vector3", gnss.velocity_enu[row])
+        twist = self._make(inner, linear, self._vector("Vector3", np.zeros(3)))
+        header = self._header(int(gnss.timestamps_ns[row]), gnss.frame_id)
+        return self.serialised(name, self._make(name, header, twist))
 
     def fix(self, gnss: GnssStream, row: int) -> bytes:
         """A sensor_msgs/NavSatFix."""

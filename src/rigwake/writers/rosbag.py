@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import re
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -16,18 +17,19 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
-from rigwake._types import Image
 from rigwake.atomic import atomic_path
-from rigwake.cameras.formats.camera_info import CameraInfo, info_from_camera
-from rigwake.errors import CameraError, UsageError
+from rigwake.cameras.formats.camera_info import ROS_LENSES, info_of_any_camera
+from rigwake.errors import UsageError
 from rigwake.readers.channels import Encoding
+from rigwake.readers.rig_description import RIG_TOPIC, TRUTH_PREFIX
 from rigwake.readers.ros_decoding import typestore
 from rigwake.readers.topics import camera_base
 from rigwake.recording import AttitudeStream, CameraStream, Finding, GnssStream, ImuStream, Recording
 from rigwake.trajectory import Trajectory
+from rigwake.writers.encoded_images import ImageEncoding, encoded_images, is_grey, lossy_remark
+from rigwake.writers.rig_text import describe, json_text
 from rigwake.writers.ros_encoding import MessageFactory
 
-ImageEncoding = Literal["jpeg", "png", "raw"]
 NAMESPACE = "/wamv/sensors"
 _COMPRESSION = {"lz4": Rosbag1Writer.CompressionFormat.LZ4, "bz2": Rosbag1Writer.CompressionFormat.BZ2}
 
@@ -111,60 +113,124 @@ def _topics(
 ) -> tuple[list[_Topic], tuple[Finding, ...]]:
     topics: list[_Topic] = []
     findings: list[Finding] = []
+    places = _places(recording, image_encoding)
     for camera in recording.cameras.values():
-        topics += _camera_topics(camera, factory, image_encoding, findings)
+        topics += _camera_topics(camera, places["cameras", camera.name], factory, image_encoding)
+        findings += lossy_remark(camera, image_encoding)
+        if camera.model is not None and camera.model.model not in ROS_LENSES:
+            words = (
+                f"ROS has no name for a {camera.model.model} lens: camera_info calls it so, which ROS's own programs "
+                f"refuse; rigwake reads it from there and from {RIG_TOPIC}."
+            )
+            findings.append(Finding("note", camera.name, words))
     for imu in recording.imus.values():
-        topics.append(_imu_topic(imu, recording.attitudes.get(imu.name), factory))
+        attitude = _same_rows(imu, recording.attitudes.get(imu.name))
+        topics.append(_imu_topic(imu, places["imus", imu.name], attitude, factory))
+    for attitude in recording.attitudes.values():
+        if ("attitudes", attitude.name) in places:
+            topics.append(_attitude_topic(attitude, places["attitudes", attitude.name], factory))
     for gnss in recording.gnss.values():
-        topics.append(_fix_topic(gnss, factory))
-        if gnss.velocity_enu is not None:
-            findings.append(Finding("note", gnss.name, "velocities are not written into bags."))
-    topics += [_pose_topic(name, poses, factory) for name, poses in recording.poses.items()]
+        topics += _gnss_topics(gnss, places["gnss", gnss.name], factory)
+    for kind, trajectories in (("poses", recording.poses), ("truth", recording.true_trajectories)):
+        for name, poses in trajectories.items():
+            topics.append(_pose_topic(places[kind, name], poses, factory))
+            findings += _unwritten_of_poses(name, poses)
+    first_ns = min(_first_stamps(recording), default=0)
     if recording.static_transforms:
-        first_ns = min(_first_stamps(recording), default=0)
         edges = dict(recording.static_transforms)
         messages = iter([(first_ns, "/tf_static", factory.transforms(first_ns, edges))])
         topics.append(_Topic("/tf_static", "tf2_msgs/msg/TFMessage", messages, latched=True))
+    content = describe(recording, places, transforms=False)
+    if content:
+        text = iter([(first_ns, RIG_TOPIC, factory.text(json_text(content)))])
+        topics.append(_Topic(RIG_TOPIC, "std_msgs/msg/String", text, latched=True))
     return topics, tuple(findings)
 
 
+def _places(recording: Recording, image_encoding: ImageEncoding) -> dict[tuple[str, str], str]:
+    """The topic of every sensor: its own where it has one that no other takes, else one made from its name."""
+    suffix = "image_raw" if image_encoding == "raw" else "image_raw/compressed"
+    places: dict[tuple[str, str], str] = {}
+
+    def place(kind: str, name: str, own: str, otherwise: str) -> None:
+        wanted = own if own.startswith("/") else otherwise
+        candidates = (wanted, otherwise, *(f"{otherwise}_{number}" for number in range(2, 1000)))
+        places[kind, name] = next(topic for topic in candidates if topic not in places.values())
+
+    for name, camera in recording.cameras.items():
+        own = f"{camera_base(camera.topic)}/{suffix}" if camera.topic.startswith("/") else ""
+        place("cameras", name, own, f"{NAMESPACE}/cameras/{_token(name)}_camera/{suffix}")
+    for name, imu in recording.imus.items():
+        place("imus", name, imu.topic, f"{NAMESPACE}/imu/{_token(name)}/data")
+    for name, attitude in recording.attitudes.items():
+        imu_of_same_rows = recording.imus.get(name)
+        if imu_of_same_rows is None or _same_rows(imu_of_same_rows, attitude) is None:
+            place("attitudes", name, attitude.topic, f"{NAMESPACE}/attitude/{_token(name)}")
+    for name, gnss in recording.gnss.items():
+        place("gnss", name, gnss.topic, f"{NAMESPACE}/gps/{_token(name)}/fix")
+    for name in recording.poses:
+        place("poses", name, "", f"/poses/{_token(name)}")
+    for name in recording.true_trajectories:
+        place("truth", name, "", f"{TRUTH_PREFIX}{_token(name)}")
+    return places
+
+
+def _token(name: str) -> str:
+    """The name as a part of a topic: ROS allows letters, digits and underscores, not a digit at first."""
+    token = re.sub(r"[^A-Za-z0-9_]", "_", name)
+    return token if token[:1].isalpha() else f"s{token}"
+
+
+def _same_rows(imu: ImuStream, attitude: AttitudeStream | None) -> AttitudeStream | None:
+    """The attitude, if it can travel in the messages of this IMU."""
+    if attitude is None or not np.array_equal(attitude.timestamps_ns, imu.timestamps_ns):
+        return None
+    return attitude
+
+
+def _unwritten_of_poses(name: str, poses: Trajectory) -> list[Finding]:
+    lost = []
+    if poses.covariances is not None and poses.covariance_kind != "poses":
+        lost.append("covariances of its increments")
+    if poses.segment_ids is not None and poses.segment_ids.any():
+        lost.append("its segments")
+    return [Finding("note", name, f"bags cannot hold {' and '.join(lost)}: left out.")] if lost else []
+
+
 def _first_stamps(recording: Recording) -> Iterator[int]:
-    for streams in (recording.cameras, recording.imus, recording.gnss, recording.poses):
+    sensors = (recording.cameras, recording.imus, recording.gnss, recording.attitudes, recording.poses)
+    for streams in sensors:
         yield from (int(s.timestamps_ns[0]) for s in streams.values() if len(s.timestamps_ns))
-
-
-def _name(topic: str, otherwise: str) -> str:
-    return topic if topic.startswith("/") else otherwise
 
 
 def _rows(name: str, message_type: str, stamps: list[int], build: Callable[[int], bytes]) -> _Topic:
     return _Topic(name, message_type, ((stamp, name, build(row)) for row, stamp in enumerate(stamps)))
 
 
-def _imu_topic(imu: ImuStream, attitude: AttitudeStream | None, factory: MessageFactory) -> _Topic:
-    if attitude is not None and not np.array_equal(attitude.timestamps_ns, imu.timestamps_ns):
-        attitude = None
-    return _rows(
-        _name(imu.topic, f"{NAMESPACE}/imu/{imu.name}/data"),
-        "sensor_msgs/msg/Imu",
-        imu.timestamps_ns.tolist(),
-        lambda row: factory.imu(imu, row, attitude),
-    )
+def _imu_topic(
+    imu: ImuStream, topic: str, attitude: AttitudeStream | None, factory: MessageFactory
+) -> _Topic:
+    stamps = imu.timestamps_ns.tolist()
+    return _rows(topic, "sensor_msgs/msg/Imu", stamps, lambda row: factory.imu(imu, row, attitude))
 
 
-def _fix_topic(gnss: GnssStream, factory: MessageFactory) -> _Topic:
-    return _rows(
-        _name(gnss.topic, f"{NAMESPACE}/gps/{gnss.name}/fix"),
-        "sensor_msgs/msg/NavSatFix",
-        gnss.timestamps_ns.tolist(),
-        lambda row: factory.fix(gnss, row),
-    )
+def _attitude_topic(attitude: AttitudeStream, topic: str, factory: MessageFactory) -> _Topic:
+    stamps = attitude.timestamps_ns.tolist()
+    return _rows(topic, "sensor_msgs/msg/Imu", stamps, lambda row: factory.attitude(attitude, row))
 
 
-def _pose_topic(name: str, trajectory: Trajectory, factory: MessageFactory) -> _Topic:
+def _gnss_topics(gnss: GnssStream, topic: str, factory: MessageFactory) -> list[_Topic]:
+    stamps = gnss.timestamps_ns.tolist()
+    topics = [_rows(topic, "sensor_msgs/msg/NavSatFix", stamps, lambda row: factory.fix(gnss, row))]
+    if gnss.velocity_enu is not None:
+        kind, beside = "geometry_msgs/msg/TwistStamped", f"{topic}_velocity"
+        topics.append(_rows(beside, kind, stamps, lambda row: factory.velocity(gnss, row)))
+    return topics
+
+
+def _pose_topic(topic: str, trajectory: Trajectory, factory: MessageFactory) -> _Topic:
     stamps = trajectory.timestamps_ns.tolist()
     poses, covariances = trajectory.world_from_body, trajectory.covariances
-    topic = f"/poses/{name}"
     if covariances is not None and trajectory.covariance_kind == "poses":
         return _rows(
             topic,
@@ -181,47 +247,34 @@ def _pose_topic(name: str, trajectory: Trajectory, factory: MessageFactory) -> _
 
 
 def _camera_topics(
-    camera: CameraStream, factory: MessageFactory, image_encoding: ImageEncoding, findings: list[Finding]
+    camera: CameraStream, topic: str, factory: MessageFactory, image_encoding: ImageEncoding
 ) -> list[_Topic]:
-    base = camera_base(_name(camera.topic, f"{NAMESPACE}/cameras/{camera.name}_camera/image_raw"))
-    name = f"{base}/image_raw" if image_encoding == "raw" else f"{base}/image_raw/compressed"
     kind = "sensor_msgs/msg/Image" if image_encoding == "raw" else "sensor_msgs/msg/CompressedImage"
-    messages = (
-        (stamp, name, factory.image(stamp, camera.frame_id, image, image_encoding))
-        for stamp, image in _images(camera)
-    )
-    topics = [_Topic(name, kind, messages)]
-    info = _info(camera, findings)
-    if info is not None:
+    topics = [_Topic(topic, kind, _image_messages(camera, topic, factory, image_encoding))]
+    if camera.model is not None:
+        info = info_of_any_camera(camera.model)
+        stamps = camera.timestamps_ns.tolist()
         topics.append(
             _rows(
-                f"{base}/camera_info",
+                f"{camera_base(topic)}/camera_info",
                 "sensor_msgs/msg/CameraInfo",
-                stamps := camera.timestamps_ns.tolist(),
+                stamps,
                 lambda row: factory.camera_info(stamps[row], camera.frame_id, info),
             )
         )
     return topics
 
 
-def _info(camera: CameraStream, findings: list[Finding]) -> CameraInfo | None:
-    if camera.model is None:
-        return None
-    try:
-        return info_from_camera(camera.model)
-    except CameraError as error:
-        findings.append(Finding("warning", camera.name, f"no camera_info is written: {error.cause}"))
-        return None
-
-
-def is_grey(camera: CameraStream) -> bool:
-    """Whether the camera's first readable image has three equal channels."""
-    for frame in camera.frames(colour=True):
-        image = frame.image
-        return bool((image[..., 0] == image[..., 1]).all() and (image[..., 1] == image[..., 2]).all())
-    return True
-
-
-def _images(camera: CameraStream) -> Iterator[tuple[int, Image]]:
-    for frame in camera.frames(colour=not is_grey(camera)):
-        yield frame.timestamp_ns, frame.image
+def _image_messages(
+    camera: CameraStream, topic: str, factory: MessageFactory, image_encoding: ImageEncoding
+) -> Iterator[_Message]:
+    if image_encoding == "raw":
+        for frame in camera.frames(colour=not is_grey(camera)):
+            yield (
+                frame.timestamp_ns,
+                topic,
+                factory.raw_image(frame.timestamp_ns, camera.frame_id, frame.image),
+            )
+        return
+    for stamp, encoded in encoded_images(camera, image_encoding):
+        yield stamp, topic, factory.encoded_image(stamp, camera.frame_id, encoded)

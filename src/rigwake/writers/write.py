@@ -7,9 +7,10 @@ from typing import Literal, get_args
 
 from rigwake.errors import UsageError
 from rigwake.recording import Finding, Recording
+from rigwake.writers.encoded_images import ImageEncoding
 from rigwake.writers.euroc_writer import write_euroc
 from rigwake.writers.folders import write_folder
-from rigwake.writers.rosbag import ImageEncoding, write_rosbag1, write_rosbag2
+from rigwake.writers.rosbag import write_rosbag1, write_rosbag2
 
 RecordingFormat = Literal["ros1", "ros2", "mcap", "euroc", "folder"]
 
@@ -31,13 +32,17 @@ def write_recording(
 
     file_format: `ros1` (bag), `ros2` (folder with sqlite3), `mcap` (a file if the path ends in `.mcap`, else
     a ROS 2 folder), `euroc`, `folder`; by default as the path's suffix says. image_encoding: `jpeg` loses a
-    little, `png` and `raw` nothing; folders cannot hold `raw`. Returns findings about what the format cannot
-    hold. Raises UsageError for an unknown format or a path that is in the way.
+    little, `png` and `raw` nothing; folders cannot hold `raw`. Images that are stored so already are handed on as
+    they are; `copy` hands on every JPEG and PNG and encodes others as JPEG. EuRoC folders hold PNG unless `copy` is
+    asked for. Returns findings about what the format cannot hold. Raises UsageError for an unknown format or a
+    path that is in the way.
     """
     path = Path(path)
     chosen = file_format or format_of_path(path)
     if image_encoding not in get_args(ImageEncoding):
-        raise UsageError(f"Image encoding {image_encoding!r} is not one of jpeg, png, raw.")
+        raise UsageError(
+            f"Image encoding {image_encoding!r} is not one of {', '.join(get_args(ImageEncoding))}."
+        )
     match chosen:
         case "ros1":
             return write_rosbag1(recording, path, image_encoding)
@@ -46,7 +51,7 @@ def write_recording(
         case "mcap":
             return write_rosbag2(recording, path, image_encoding, "mcap")
         case "euroc":
-            return write_euroc(recording, path)
+            return write_euroc(recording, path, "copy" if image_encoding == "copy" else "png")
         case "folder":
             return write_folder(recording, path, image_encoding)
     raise UsageError(

@@ -22,7 +22,7 @@ _COLMAP_PIXEL_SHIFT = 0.5  # COLMAP's (0, 0) is the corner of the top-left pixel
 def _no_form(tool: str, camera: CameraModel, reason: str = "") -> CameraError:
     return CameraError(
         f"{tool} has no form for this {camera.model} lens{reason}.",
-        remedy="Convert it first (`rigwake.cameras.convert.convert_camera`).",
+        remedy="Convert it first (`rigwake.cameras.model_fitting.convert_camera`).",
     )
 
 
