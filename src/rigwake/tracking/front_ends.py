@@ -18,6 +18,7 @@ from rigwake.recording import CameraStream, Frame
 from rigwake.tracking.descriptor_front_end import DescriptorFrontEnd
 from rigwake.tracking.klt_front_end import KltFrontEnd, Observed
 from rigwake.tracking.masks import CameraMask, lens_mask, shrunk
+from rigwake.tracking.picture_scale import octaves_to_skip
 from rigwake.tracking.tracking_options import TrackingOptions
 from rigwake.tracking.water import HorizonMask
 from rigwake.tracks import TrackingReport, Tracks
@@ -49,9 +50,10 @@ def track_camera(
             consequence="Pixels cannot be turned into bearings.",
             remedy="Give a model for it, or calibrate one with `rigwake intrinsics`.",
         )
-    usable = _static_region(stream, options, mask)
     chosen = np.arange(len(stream)) if indices is None else np.asarray(indices)
-    front_end = _front_end(stream.model, options)
+    octaves = octaves_to_skip(stream, chosen) if options.front_end == "klt" else 0
+    usable = _static_region(stream, options, mask, options.patch_radius_px * 2**octaves)
+    front_end = _front_end(stream.model, options, octaves)
     last_ns: int | None = None
     horizon = None if up_cam is None else HorizonMask(stream.model)
     run = _TrackingRun()
@@ -104,17 +106,19 @@ class FrontEnd(Protocol[Prepared]):
         """Observations in the next image; `usable` (H, W) says where points may be, `high` where most is sky."""
 
 
-def _front_end(model: CameraModel, options: TrackingOptions) -> FrontEnd[Any]:
-    return KltFrontEnd(model, options) if options.front_end == "klt" else DescriptorFrontEnd(options)
+def _front_end(model: CameraModel, options: TrackingOptions, octaves: int) -> FrontEnd[Any]:
+    return KltFrontEnd(model, options, octaves) if options.front_end == "klt" else DescriptorFrontEnd(options)
 
 
-def _static_region(stream: CameraStream, options: TrackingOptions, mask: CameraMask | None) -> Mask:
-    """Where points may be in every frame."""
+def _static_region(
+    stream: CameraStream, options: TrackingOptions, mask: CameraMask | None, reach_px: int
+) -> Mask:
+    """Where points may be in every frame; patches reach so far about them."""
     usable = lens_mask(stream).usable
     if mask is not None:
         usable &= mask.usable
     # a patch that reaches over the edge of the lens or the hull would hold on to it
-    usable = shrunk(usable, options.patch_radius_px)
+    usable = shrunk(usable, reach_px)
     if options.region_of_interest is not None:
         x, y, width, height = options.region_of_interest
         within = np.zeros_like(usable)

@@ -86,8 +86,10 @@ def beyond_lens(model: CameraModel, margin: float = np.deg2rad(1.0)) -> Mask:
 
 
 def beyond_image_circle(stream: CameraStream, frames: int = 20) -> Mask:
-    """(H, W), True where a lens throws no light: what stays dark in all of the frames looked at and reaches the
-    edge of the image, widened by 1 % of the image height. Nothing if the whole image stays dark, as at night."""
+    """(H, W), True where a lens throws no light: what stays dark in all of the frames looked at, reaches the edge of
+    the image and lies outside the convex hull of what does not, widened by 1 % of the image height. A lens lights a
+    convex region; darkness between lit things is that of the scene. Nothing if the whole image stays dark, as at
+    night."""
     indices = np.unique(np.linspace(0, max(len(stream) - 1, 0), frames).astype(np.int64))
     brightest = np.zeros((stream.height_px, stream.width_px), np.uint8)
     for frame in stream.frames(indices):
@@ -97,9 +99,19 @@ def beyond_image_circle(stream: CameraStream, frames: int = 20) -> Mask:
         return np.zeros_like(dark)
     _, labels = cv2.connectedComponents(dark.astype(np.uint8))
     rim = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
-    outside = np.isin(labels, rim[rim > 0])
+    outside = np.isin(labels, rim[rim > 0]) & ~_convex_hull(~dark)
     reach = 2 * max(stream.height_px // 100, 1) + 1
     return np.asarray(cv2.dilate(outside.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0)
+
+
+def _convex_hull(region: Mask) -> Mask:
+    """(H, W), True within the convex hull of a region without its specks."""
+    solid = cv2.erode(region.astype(np.uint8), np.ones((3, 3), np.uint8))
+    points = cv2.findNonZero(solid)
+    filled = np.zeros(region.shape, np.uint8)
+    if points is not None:
+        cv2.fillConvexPoly(filled, cv2.convexHull(points), 1)
+    return np.asarray(filled > 0)
 
 
 def lens_mask(stream: CameraStream) -> CameraMask:

@@ -63,12 +63,15 @@ def register(
     predicted_warps: Array,
     *,
     warp_prior_std: float,
+    noise_variance: float = np.inf,
     max_shift_px: float = 3.0,
     iterations: int = 8,
 ) -> Registration:
     """Find reference patches in an image, starting at `pixels` (N, 2) and `predicted_warps` (N, 2, 2).
 
     warp_prior_std: how far each entry of the warp may stray from the prediction, in px per px.
+    noise_variance: of residuals, grey levels^2, beyond which they are taken for misfit and not for noise: a patch
+        that does not fit yet must not lean on its prediction for that.
     max_shift_px: a patch that moves further from its start has diverged.
     """
     n = len(references)
@@ -81,7 +84,7 @@ def register(
         _register(
             first, last, coefficients, references.pattern, references.information, references.contrast,
             shape.offsets, shape.root_weights, shape.lower_right, shape.lower_left, 1.0 / warp_prior_std**2,
-            max_shift_px, iterations, pixels, warps, found, correlation, variance, spread, lag_sums,
+            noise_variance, max_shift_px, iterations, pixels, warps, found, correlation, variance, spread, lag_sums,
         )  # fmt: skip
 
     over_ranges(ranges(np.ones(n), _LEAST_PATCHES), work)
@@ -106,7 +109,8 @@ def _noise_bandwidth(lag_sums: Array) -> float:
 @njit(cache=True, nogil=True, fastmath=SUMS_IN_ANY_ORDER)
 def _register(  # type: ignore[no-untyped-def]
     first, last, coefficients, pattern, information, contrast, offsets, root_weights, lower_right, lower_left,
-    warp_precision, max_shift_px, iterations, pixels, warps, found, correlation, variance, spread, lag_sums,
+    warp_precision, noise_variance, max_shift_px, iterations, pixels, warps, found, correlation, variance, spread,
+    lag_sums,
 ):  # fmt: skip
     """Moves `pixels` and `warps` of a range of patches; the arrays after them, which are zero, are filled."""
     n_samples = pattern.shape[2]
@@ -130,7 +134,8 @@ def _register(  # type: ignore[no-untyped-def]
                 _neighbour_products(values, pattern[n], sums, lower_right, lower_left, lag_sums[n])
                 break
             strayed = _product(prediction_from_patch, _entries(warps[n]))
-            _normal_equations(gain, information[n], sums, warp_precision * variance[n], strayed, matrix, step)
+            weight = warp_precision * min(variance[n], noise_variance)
+            _normal_equations(gain, information[n], sums, weight, strayed, matrix, step)
             moved = _step(matrix, step, pixels[n], warps[n])
             shift = max(abs(pixels[n, 0] - start_x), abs(pixels[n, 1] - start_y))
             if moved < 0 or shift > max_shift_px:

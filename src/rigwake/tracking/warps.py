@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit
 
 from rigwake._types import Array, Mask
-from rigwake.cameras.protocol import CameraModel
 from rigwake.geometry import so3
+from rigwake.tracking.picture_scale import Rays
 
 _STENCIL_PX = 2.0
 _STENCIL = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [0, 0]]) * _STENCIL_PX
@@ -60,7 +60,7 @@ def _kabsch(before: Array, after: Array) -> Array:
     return rotation
 
 
-def stencil_bearings(model: CameraModel, pixels: Array) -> tuple[Array, Mask]:
+def stencil_bearings(model: Rays, pixels: Array) -> tuple[Array, Mask]:
     """Bearings (N, 7, 3) of pixels (N, 2) and of six pixels about each of them, and validity (N,).
 
     These are 2 px to the right, left, below and above, on the diagonal to the lower right and upper left, and the
@@ -68,11 +68,13 @@ def stencil_bearings(model: CameraModel, pixels: Array) -> tuple[Array, Mask]:
     """
     n_points = len(_STENCIL)
     bearings, valid = model.unproject((pixels[:, None] + _STENCIL).reshape(-1, 2))
-    return bearings.reshape(-1, n_points, 3), np.asarray(valid.reshape(-1, n_points).all(axis=1))
+    return bearings.reshape(len(pixels), n_points, 3), np.asarray(
+        valid.reshape(len(pixels), n_points).all(axis=1)
+    )
 
 
 def rotation_warps(
-    model: CameraModel, reference_stencils: Array, after_from_reference: Array, bearings_after: Array
+    model: Rays, reference_stencils: Array, after_from_reference: Array, bearings_after: Array
 ) -> tuple[Array, Array, Mask]:
     """Warps of patches by the turn of the camera: affine (N, 2, 2), their bends (N, 2, 3), and validity (N,).
 
@@ -85,13 +87,13 @@ def rotation_warps(
     turned = _smallest_rotation(centres, bearings_after) @ after_from_reference
     stencils = np.einsum("nij,nkj->nki", turned, reference_stencils)
     pixels, valid = model.project(stencils.reshape(-1, 3))
-    pixels = pixels.reshape(len(stencils), -1, 2)
+    pixels = pixels.reshape(len(stencils), len(_STENCIL), 2)
     right, left, below, above, lower_right, upper_left, centre = pixels.transpose(1, 0, 2)
     warps = np.stack([right - left, below - above], axis=2) / (2 * _STENCIL_PX)
     second_xx, second_yy = right + left - 2 * centre, below + above - 2 * centre
     second_xy = (lower_right + upper_left - 2 * centre - second_xx - second_yy) / 2
     second_order = np.stack([second_xx, second_xy, second_yy], axis=2) / _STENCIL_PX**2
-    good = np.asarray(valid.reshape(len(stencils), -1).all(axis=1))
+    good = np.asarray(valid.reshape(len(stencils), len(_STENCIL)).all(axis=1))
     warps[~good] = np.eye(2)
     second_order[~good] = 0.0
     return warps, second_order, good
