@@ -91,6 +91,7 @@ USED = [
         (0, 1, 2),
         "",
     ),
+    ("evaluate {calibration} --truth {calibration} --frame imu", (0, 1, 2), ""),
     ("convert {images} --out {here}/v2.bag", 0, "next:"),
     ("convert {images} --output {here}/v3.mcap", 0, "next:"),
     (
