@@ -15,6 +15,7 @@ from rigwake.ba.solver.linear_factors import (
     camera_distance_factor,
     distance_factor,
     gnss_factors,
+    lasting_error_factors,
     measured_factors,
     pose_factors,
     relative_factors,
@@ -27,6 +28,7 @@ from rigwake.ba.solver.rig_problem import (
     CameraDistance,
     DistanceMeasurement,
     Gravity,
+    LastingErrors,
     PoseMeasurements,
     PosePrior,
     RelativeMeasurements,
@@ -95,6 +97,24 @@ COVARIANCES = np.diag([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]) ** 2
 @pytest.mark.parametrize("imu", [True, False])
 def test_gnss(imu: bool) -> None:
     check(free_rig(replace(FEW, imu=imu)), lambda p, layout: [gnss_factors(p, layout, PLAIN)])
+
+
+def test_the_receivers_delay_and_lasting_errors() -> None:
+    problem = free_rig(replace(FEW, imu=True))
+    first = int(problem.states.timestamps_ns[0])
+    nodes = first + np.array([0, 400_000_000, 1_000_000_000])
+    errors = LastingErrors(
+        nodes, np.random.default_rng(0).normal(0, 0.3, (3, 3)), np.array([0.5, 0.4, 0.8]), 20.0
+    )
+    delay = VectorPrior.from_std(0.0, 0.05)
+    antenna = replace(problem.antenna, time_offset_s=0.004, time_offset_prior=delay, errors=errors)
+    check(
+        replace(problem, antenna=antenna),
+        lambda p, layout: [
+            gnss_factors(p, layout, PLAIN),
+            *lasting_error_factors(p.antenna.errors, layout),
+        ],
+    )
 
 
 @pytest.mark.parametrize("imu", [True, False])

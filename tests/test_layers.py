@@ -34,6 +34,7 @@ LAYERS = [
     ["odometry"],
     ["handeye"],
     ["ba.rig"],  # the rig problem: initial values, cross-camera association, rounds of outlier rejection
+    ["plausibility"],  # does a sensor agree with the others?
     ["simulation"],
     ["exporters"],
     ["report"],

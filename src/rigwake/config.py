@@ -36,6 +36,7 @@ class CalibrateConfig(BaseModel):
     cameras: which to calibrate (all by default). start_s, duration_s: the part of the recording to use.
     jobs: processes (0: as many as there are cores). seed: of everything random.
     time_offsets: estimate the cameras' clocks. imu, gnss: whether to use them.
+    sensor_checks: compare every sensor with the others; repair: correct units, leave out samples that cannot be right.
     line_delay_s: read-out time per row of rolling shutters, by camera; estimate_line_delay: refine it.
     """
 
@@ -51,6 +52,8 @@ class CalibrateConfig(BaseModel):
     imu: bool = True
     gnss: bool = True
     find_self_mask: bool = True
+    sensor_checks: bool = True
+    repair: bool = True
     line_delay_s: dict[str, float] = Field(default_factory=dict)
     estimate_line_delay: bool = False
     imu_noise: ImuNoiseSettings = ImuNoiseSettings()

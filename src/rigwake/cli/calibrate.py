@@ -52,6 +52,10 @@ def command(
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace the result that the folder holds.")] = False,
     allow_partial: AllowPartialOption = False,
+    repair: Annotated[
+        bool,
+        typer.Option("--repair/--no-repair", help="Correct units, leave out samples that cannot be right."),
+    ] = True,
     jobs: Annotated[int | None, typer.Option(help="Processes (default: one per core).")] = None,
     seed: Annotated[int | None, typer.Option(help="Random seed.")] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file of settings.")] = None,
@@ -93,6 +97,7 @@ def command(
         duration_s=duration,
         jobs=jobs,
         seed=seed,
+        repair=None if repair else False,
     )
     if print_config:
         import yaml
@@ -123,7 +128,7 @@ def command(
         from rigwake.report.rerun_log import log_to_rerun
 
         log_to_rerun(load_report_content(run.out), None, view)
-    if run.failed and not allow_partial:
+    if run.is_partial and not allow_partial:
         raise PartialResultError(
             f"{_headline(run)}.",
             consequence=f"The others are in {run.out / 'calibration.yaml'}.",
@@ -133,11 +138,16 @@ def command(
 
 def _print_run(run: CalibrationRun) -> None:
     """The rig, what was given up and noted, what was written, what to do next."""
-    if run.failed:
+    if run.is_partial:
         out.print(f"[bold red]{escape(_headline(run))}[/bold red]")
     print_calibration(run.calibration)
     for name, reason in run.failed.items():
         out.print(f"[red]{escape(name)} is not calibrated:[/red] {escape(reason.removeprefix(f'{name}: '))}")
+    for check in run.sensor_checks:
+        if check.action != "none":
+            out.print(f"[yellow]{check.action}:[/yellow] {escape(check.sentence)}", soft_wrap=True)
+        elif check.hypothesis:
+            out.print(f"[dim]note: {escape(check.sentence)}[/dim]", soft_wrap=True)
     for note in run.notes:
         out.print(f"[dim]note: {escape(note)}[/dim]")
     out.print(f"written: {escape(f'{run.out}/calibration.yaml, {run.out}/report.html')}", soft_wrap=True)
@@ -145,12 +155,19 @@ def _print_run(run: CalibrationRun) -> None:
 
 
 def _headline(run: CalibrationRun) -> str:
-    """Which cameras are missing from the result."""
+    """Which cameras are missing from the result, and which other sensors were left out of it."""
     count = len(run.failed)
     total = count + len(run.calibration.cameras)
-    return (
-        f"{count} of {total} cameras {'is' if count == 1 else 'are'} not calibrated: {', '.join(run.failed)}"
-    )
+    words = []
+    if count:
+        are = "is" if count == 1 else "are"
+        words.append(f"{count} of {total} cameras {are} not calibrated: {', '.join(run.failed)}")
+    others = [
+        c.sensor for c in run.sensor_checks if c.action == "left out" and not c.sensor.startswith("camera ")
+    ]
+    if others:
+        words.append(f"left out, as it contradicts the others: {', '.join(others)}")
+    return "; ".join(words)
 
 
 def _millimetres(value_m: float, std_m: float) -> str:

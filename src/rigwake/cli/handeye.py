@@ -79,9 +79,12 @@ def command(
     inputs = [_Input.parse(text) for text in (reference, *others)]
     require_there(*(one.path for one in inputs))
     from rigwake.calibration import save_calibration
+    from rigwake.errors import UnobservableError
     from rigwake.handeye.handeye_result import HandeyeOptions
     from rigwake.handeye.joint_calibration import calibrate_handeye
     from rigwake.handeye.one_body import in_one_unit
+    from rigwake.plausibility.handeye_fit import check_handeye, explain_failure
+    from rigwake.plausibility.values import checks_to_list, refuse
 
     meanings = [_meaning(one, columns or (), frame or ()) for one in inputs]
     trajectories = [_read(one, *meaning) for one, meaning in zip(inputs, meanings, strict=True)]
@@ -95,7 +98,12 @@ def command(
         time_offset=time_offset,
         scale=scale,
     )
-    result = calibrate_handeye(trajectories[0], trajectories[1:], options)
+    try:
+        result = calibrate_handeye(trajectories[0], trajectories[1:], options)
+    except UnobservableError as error:
+        raise explain_failure(trajectories[0], trajectories[1:], error, options) from error
+    checks = check_handeye(trajectories[0], trajectories[1:], result, options) if method == "ml" else ()
+    refuse(checks, "No calibration is made from it.")
     if output is not None:
         provenance = {
             "command": "handeye",
@@ -105,10 +113,15 @@ def command(
         }
         save_calibration(result.calibration(provenance), output)
     if json_file is not None:
-        write_json(json_file, result_to_json(result))
+        write_json(json_file, result_to_json(result) | {"sensor_checks": checks_to_list(checks)})
         if str(json_file) == "-":
             return
     _print(result)
+    for check in checks:
+        agreement = f"{100 * check.statistic:.1f} % of its motion does not agree"
+        out.print(
+            f"[dim]{escape(check.sensor)}: {agreement}. {escape(check.hypothesis)}[/dim]", soft_wrap=True
+        )
     if output is not None:
         next_step(
             ["rigwake", "export", output, "--to", "csv"], "a table; mountings without a lens fit json and csv"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 import typer
 from rich.markup import escape
 
-from rigwake.cli.console import figures_table, next_step, out, progress_bar, write_json
+from rigwake.cli.console import err, figures_table, next_step, out, progress_bar, write_json
 from rigwake.cli.options import (
     AllowPartialOption,
     CameraFileOption,
@@ -28,6 +28,7 @@ from rigwake.workers import run_in_processes
 
 if TYPE_CHECKING:
     from rigwake.odometry.camera_odometry import CameraOdometry, CameraOdometryOptions
+    from rigwake.plausibility.values import SensorCheck
     from rigwake.recording import AttitudeStream, CameraStream, GnssStream, ImuStream, Recording
 
 _METHODS = ("adjusted", "seed")
@@ -84,6 +85,10 @@ def command(
     topic: TopicOption = None,
     topics: TopicsOption = None,
     camera_file: CameraFileOption = None,
+    repair: Annotated[
+        bool,
+        typer.Option("--repair/--no-repair", help="Correct units, leave out samples that cannot be right."),
+    ] = True,
     json_file: JsonOption = None,
 ) -> None:
     """Where a camera was, frame by frame: metric with an IMU or GNSS, up to scale without, and says so.
@@ -101,6 +106,7 @@ def command(
     from rigwake.odometry.odometry_options import OdometryOptions
     from rigwake.odometry.thesis_odometry import ThesisOptions
     from rigwake.pipeline.out_folder import check_camera_names, used_by_one
+    from rigwake.plausibility.values import checks_to_list, refuse
     from rigwake.readers.open import open_recording
     from rigwake.readers.topics import TopicMap
     from rigwake.recording import main_gnss, main_imu
@@ -130,15 +136,21 @@ def command(
         main_gnss(opened) if gnss else None,
         _first(opened.attitudes) if attitude else None,
     )
+    sensors = _vetted(sensors, streams, repair)
     with used_by_one(output), unchanged(recording) as check_unchanged:
         results = _run_all(streams, sensors, options, jobs)
         check_unchanged()
+        checks = _compared(sensors, streams, results)
         if json_file is not None:
-            write_json(json_file, _summary(opened, results))
+            write_json(json_file, _summary(opened, results) | {"sensor_checks": checks_to_list(checks)})
         _keep(results, output, quiet=str(json_file) == "-")
     done = {name: result for name, result in results.items() if not isinstance(result, RigwakeError)}
     if str(json_file) != "-":
         _name_next_step(recording, done, output, topic_words(topic, topics))
+    lenses = [c for c in checks if not c.agrees and "lens" in c.hypothesis]
+    for check in lenses:
+        err.print(f"[yellow]{escape(check.sentence)}[/yellow]", soft_wrap=True)
+    refuse([c for c in checks if c not in lenses], "What was written is not to be trusted.")
     missing = [name for name in results if name not in done]
     if missing and not allow_partial:
         raise PartialResultError(
@@ -147,6 +159,35 @@ def command(
             consequence=f"The others are in {output}.",
             remedy="See the reasons above. With --allow-partial, such a result counts as done (exit code 0).",
         )
+
+
+def _vetted(sensors: Sensors, streams: list[CameraStream], repair: bool) -> Sensors:
+    """The IMU with its units repaired; raises InputError where more is wrong with it than that."""
+    from rigwake.pipeline.sensor_checks import vet_imu
+    from rigwake.pipeline.stream_selection import Selection
+
+    if sensors.imu is None:
+        return sensors
+    cameras = {stream.name: stream for stream in streams}
+    found = vet_imu(Selection(cameras, sensors.imu, None), tuple(cameras), repair=repair)
+    for check in found.checks:
+        if check.action != "none" or check.hypothesis:
+            err.print(f"[yellow]{escape(check.sentence)}[/yellow]", soft_wrap=True)
+    return sensors._replace(imu=found.selection.imu)
+
+
+def _compared(
+    sensors: Sensors, streams: list[CameraStream], results: dict[str, CameraOdometry | RigwakeError]
+) -> tuple[SensorCheck, ...]:
+    """Every camera's own motion against its lens and the IMU."""
+    from rigwake.pipeline.sensor_checks import compare_sensors
+
+    done = {n: r for n, r in results.items() if not isinstance(r, RigwakeError) and r.visual is not None}
+    lenses = {s.name: s.model for s in streams if s.model is not None}
+    models = {n: lenses[n] if r.lens is None else r.lens.camera for n, r in done.items()}
+    paths = {n: r.visual.trajectory for n, r in done.items() if r.visual is not None}
+    tracks = {n: r.tracks for n, r in done.items()}
+    return compare_sensors(sensors.imu, tracks, models, paths, repair=False).checks
 
 
 def _keep(results: dict[str, CameraOdometry | RigwakeError], output: Path, quiet: bool) -> None:

@@ -19,6 +19,7 @@ from rigwake.tracking.masks import CameraMask, lens_mask, mask_from_file
 from rigwake.tracking.self_mask import find_self_mask
 from rigwake.tracking.tracking_options import TrackingOptions
 from rigwake.tracks import Tracks
+from rigwake.trajectory import Trajectory
 
 Progress = Callable[[str, int, int], None]
 """Told a stage, and how much of it is done of how much in all."""
@@ -45,18 +46,20 @@ def measure_camera(
     hull: bool = True,
     horizon: bool = True,
     mask_file: Path | None = None,
+    turns: Trajectory | None = None,
 ) -> CameraMeasurement:
     """Mask, gyro and tracks of a camera; the gyro tells where the horizon is, and below it nothing is tracked.
 
     hull: look for the own boat in view. horizon: leave out what lies below it. mask_file: a picture of the camera's
-    size, white where it may be used. A hull that is not found and a gyro that does not fit are noted and done
+    size, white where it may be used. turns: what `visual_rotations` finds, if that is known.
+    A hull that is not found and a gyro that does not fit are noted and done
     without. Raises EstimationError where nothing can be tracked.
     """
     notes: list[str] = []
     marks = [time.perf_counter()]
     progress("looking for lens border and hull, comparing its turns with the gyro", 0, 1)
     with ThreadPoolExecutor(1) as beside:
-        turning = beside.submit(_gyro, stream, imu)
+        turning = beside.submit(_gyro, stream, imu, turns)
         mask = _mask(stream, hull, mask_file, notes)
         gyro, gyro_notes = turning.result()
     notes += gyro_notes
@@ -91,11 +94,13 @@ def _mask(stream: CameraStream, hull: bool, mask_file: Path | None, notes: list[
     return mask
 
 
-def _gyro(stream: CameraStream, imu: ImuStream | None) -> tuple[GyroAlignment | None, list[str]]:
+def _gyro(
+    stream: CameraStream, imu: ImuStream | None, turns: Trajectory | None
+) -> tuple[GyroAlignment | None, list[str]]:
     """How camera and IMU are turned towards each other, roughly; None, and why, where that cannot be told yet."""
     if imu is None:
         return None, []
     try:
-        return align_gyro(visual_rotations(stream), imu), []
+        return align_gyro(turns if turns is not None else visual_rotations(stream), imu), []
     except (UnobservableError, EstimationError) as error:
         return None, [f"tracking is not aided by the gyroscope: {error.cause}"]

@@ -36,8 +36,10 @@ from rigwake.pipeline.out_folder import check_camera_names, check_out_folder, cl
 from rigwake.pipeline.outputs import write_outputs
 from rigwake.pipeline.prior import RigPrior
 from rigwake.pipeline.rig_stage import RigEstimate, estimate_rig, initialise_rig
+from rigwake.pipeline.sensor_checks import VettedSensors, vet_imu, vet_sensors
 from rigwake.pipeline.stage_files import StageLedger
 from rigwake.pipeline.stream_selection import Selection, select
+from rigwake.plausibility.values import SensorCheck, checks_to_list
 from rigwake.readers.open import open_recording
 from rigwake.readers.topics import TopicMap
 from rigwake.readers.trajectories import read_trajectory
@@ -58,6 +60,12 @@ class CalibrationRun:
     out: Path
     failed: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    sensor_checks: tuple[SensorCheck, ...] = ()
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether a camera or another sensor had to be left out."""
+        return bool(self.failed) or any(check.action == "left out" for check in self.sensor_checks)
 
 
 def _silent(name: str, what: str, fraction: float) -> None:
@@ -108,11 +116,11 @@ def calibrate(
             identity = input_fingerprint(path)
             provenance = _provenance(identity, prepared, topics, external)
             ledger = StageLedger(out, resume=resume)
-            outcomes = _each_camera(prepared, out, ledger, identity, progress)
+            selection, outcomes, checks = _each_camera(prepared, out, ledger, identity, progress)
             check_unchanged()
-            estimated = _estimate(prepared, out, outcomes, progress)
+            estimated = _estimate(prepared, out, selection, outcomes, progress)
             check_unchanged()
-            return _conclude(prepared, out, outcomes, estimated, provenance, progress)
+            return _conclude(prepared, out, outcomes, checks, estimated, provenance, progress)
 
 
 def _prepare(
@@ -131,22 +139,30 @@ def _prepare(
 
 @dataclass(frozen=True, eq=False)
 class _Estimated:
-    """own: the trajectories that were used, by camera."""
+    """own: the trajectories that were used, by camera. vetted: the sensors that were, and what was said of them."""
 
     own: Mapping[str, Trajectory]
     first: InitialRig
     rig: RigEstimate
+    vetted: VettedSensors
 
 
 def _estimate(
-    prepared: _Prepared, out: Path, outcomes: list[CameraOutcome], progress: Progress
+    prepared: _Prepared, out: Path, selection: Selection, outcomes: list[CameraOutcome], progress: Progress
 ) -> _Estimated:
-    """Initial values and the rig, of the cameras that did not fail."""
-    selection, config = prepared.selection, prepared.config
+    """Initial values and the rig, of the cameras that did not fail and the sensors that agree."""
+    config = prepared.config
     working = _working(outcomes)
     tracks = {name: load_tracks(tracks_file(out, name)) for name in working}
     own = _trajectories(working, out, prepared.external)
-    prior = without_cameras(prepared.prior, selection.cameras.keys() - own.keys())
+    vetted = VettedSensors(selection)
+    if config.sensor_checks:
+        progress("rig", "comparing the sensors", 0.0)
+        odd = frozenset(o.name for o in outcomes if o.without_horizon)
+        vetted = vet_sensors(selection, tracks, own, without_horizon=odd, repair=config.repair)
+        selection = vetted.selection
+        own = {name: path for name, path in own.items() if name in selection.cameras}
+    prior = without_cameras(prepared.prior, prepared.selection.cameras.keys() - own.keys())
     first = initialise_rig(selection, own, config, prior)
     save_calibration(first.handeye, out / "initial_rig.yaml")
     rig = estimate_rig(
@@ -159,38 +175,53 @@ def _estimate(
         masks=out / "masks",
         progress=lambda words, fraction: progress("rig", words, fraction),
     )
-    return _Estimated(own, first, rig)
+    return _Estimated(own, first, rig, vetted)
 
 
 def _conclude(
     prepared: _Prepared,
     out: Path,
     outcomes: list[CameraOutcome],
+    checks: tuple[SensorCheck, ...],
     estimated: _Estimated,
     provenance: dict[str, Any],
     progress: Progress,
 ) -> CalibrationRun:
     """Everything that is known of the result, written."""
-    selection, first, rig = prepared.selection, estimated.first, estimated.rig
-    failed = _left_out(prepared, outcomes, estimated.own, first, rig.calibration)
+    vetted, first, rig = estimated.vetted, estimated.first, estimated.rig
+    selection, checks = vetted.selection, (*checks, *vetted.checks, *rig.sensor_checks)
+    failed = _left_out(prepared, outcomes, estimated.own, first, rig.calibration) | {
+        name.removeprefix("camera "): why
+        for name, why in vetted.left_out.items()
+        if name.startswith("camera ")
+    }
     notes = (*selection.notes, *(f"{o.name}: {n}" for o in outcomes for n in o.notes), *first.notes)
     notes += _noisy_imu(rig.calibration)
     calibration = replace(
         rig.calibration,
-        checks={**rig.calibration.checks, "failed_cameras": failed, "notes": list(notes)},
+        checks={
+            **rig.calibration.checks,
+            "failed_cameras": failed,
+            "sensor_checks": checks_to_list(checks),
+            "notes": list(notes),
+        },
         provenance={**provenance, "leader": first.reference_camera},
     )
     write_outputs(out, calibration, rig.adjusted, first, selection, rig.matches)
     progress("rig", "writing the report", 0.95)
     build_report(load_report_content(out))
-    return CalibrationRun(calibration, out, failed, notes)
+    return CalibrationRun(calibration, out, failed, notes, checks)
 
 
 def _each_camera(
     prepared: _Prepared, out: Path, ledger: StageLedger, identity: Mapping[str, Any], progress: Progress
-) -> list[CameraOutcome]:
-    """Mask, tracks and odometry of every camera; those that a former run finished are read from its files."""
+) -> tuple[Selection, list[CameraOutcome], tuple[SensorCheck, ...]]:
+    """Mask, tracks and odometry of every camera; those that a former run finished are read from its files.
+
+    Before, the IMU is compared with the cameras' coarse rotations: a wrong one would spoil what follows.
+    """
     selection, config, odometry = prepared.selection, prepared.config, prepared.external is None
+    checks: tuple[SensorCheck, ...] = ()
     changed_at = files_changed_at(prepared.path)
     keys = {
         name: camera_key(stream, selection.imu, config, odometry, identity, changed_at)
@@ -198,12 +229,22 @@ def _each_camera(
     }
     outcomes: dict[str, CameraOutcome] = {}
     jobs = []
+    turns: Mapping[str, Trajectory] = {}
+    if config.sensor_checks:
+        fresh = tuple(
+            name
+            for name in selection.cameras
+            if not ledger.is_done(f"camera {name}", keys[name], tracks_file(out, name))
+        )
+        progress("rig", "comparing the IMU with the cameras' turns", 0.0)
+        vetted = vet_imu(selection, fresh or tuple(selection.cameras)[:1], repair=config.repair)
+        selection, checks, turns = vetted.selection, vetted.checks, vetted.turns
     for name, stream in selection.cameras.items():
         if ledger.is_done(f"camera {name}", keys[name], *stage_files(out, name, odometry=odometry)):
             outcomes[name] = load_outcome(out, name)
             progress(name, "taken from the former run", 1.0)
         else:
-            jobs.append(CameraJob(stream, selection.imu, out, config, odometry))
+            jobs.append(CameraJob(stream, selection.imu, out, config, odometry, turns.get(name)))
 
     def finished(outcome: CameraOutcome) -> None:
         outcomes[outcome.name] = outcome
@@ -214,7 +255,7 @@ def _each_camera(
     if jobs:
         clear_results(out, everything=False)
         process_cameras(jobs, config.jobs, progress, finished)
-    return [outcomes[name] for name in selection.cameras]
+    return selection, [outcomes[name] for name in selection.cameras], checks
 
 
 def _working(outcomes: list[CameraOutcome]) -> list[str]:

@@ -17,6 +17,7 @@ from rigwake.errors import HostError, InputError, RigwakeError
 from rigwake.odometry.measure import measure_camera
 from rigwake.odometry.monocular import estimate_monocular
 from rigwake.recording import CameraStream, ImuStream
+from rigwake.trajectory import Trajectory
 from rigwake.writers.trajectory_writer import write_tum
 
 StageProgress = Callable[[str, float], None]
@@ -25,18 +26,21 @@ StageProgress = Callable[[str, float], None]
 
 @dataclass(frozen=True, eq=False)
 class CameraJob:
-    """What a camera's process needs. odometry: whether to estimate it, or only to track."""
+    """What a camera's process needs. odometry: whether to estimate it, or only to track. turns: coarse ones, if
+    they are known already."""
 
     stream: CameraStream
     imu: ImuStream | None
     out: Path
     config: CalibrateConfig
     odometry: bool = True
+    turns: Trajectory | None = None
 
 
 @dataclass(frozen=True)
 class CameraOutcome:
-    """How it went. failed: why not, or None."""
+    """How it went. failed: why not, or None. without_horizon: nothing could be followed above the horizon that the IMU
+    tells, and what lies below it was followed too: good to say why, not to be calibrated from."""
 
     name: str
     failed: str | None
@@ -44,6 +48,7 @@ class CameraOutcome:
     notes: tuple[str, ...] = ()
     counts: dict[str, Any] | None = None
     seconds: float = 0.0
+    without_horizon: bool = False
 
 
 def tracks_file(out: Path, camera: str) -> Path:
@@ -90,19 +95,37 @@ def process_camera(job: CameraJob, report_stage: StageProgress) -> CameraOutcome
         raise  # not the camera's fault: all stop
     except RigwakeError as error:
         outcome = CameraOutcome(name, str(error), unobservable=error.exit_code == 3)
+        if job.imu is not None and job.config.sensor_checks:
+            outcome = _once_more(job, report_stage, outcome)
     outcome = replace(outcome, seconds=time.perf_counter() - started)
     write_text_atomic(outcome_file(job.out, name), json.dumps(asdict(outcome), indent=1) + "\n")
     return outcome
 
 
-def _process(job: CameraJob, report_stage: StageProgress) -> CameraOutcome:
+def _once_more(job: CameraJob, report_stage: StageProgress, failed: CameraOutcome) -> CameraOutcome:
+    """What the images show without the IMU's horizon, which mirrored pictures put the wrong way up."""
+    try:
+        return replace(_process(job, report_stage, horizon=False), without_horizon=True)
+    except RigwakeError:
+        return failed
+
+
+def _process(job: CameraJob, report_stage: StageProgress, *, horizon: bool = True) -> CameraOutcome:
     stream, config = job.stream, job.config
     assert stream.model is not None
 
     def progress(stage: str, done: int, total: int) -> None:
         report_stage(stage, done / max(total, 1))
 
-    measured = measure_camera(stream, job.imu, config.tracking, progress, hull=config.find_self_mask)
+    measured = measure_camera(
+        stream,
+        job.imu,
+        config.tracking,
+        progress,
+        hull=config.find_self_mask,
+        horizon=horizon,
+        turns=job.turns,
+    )
     measured.mask.save(job.out / "masks", stream.name)
     tracks = measured.tracks
     tracks.save(tracks_file(job.out, stream.name))

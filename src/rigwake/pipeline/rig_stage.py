@@ -26,6 +26,8 @@ from rigwake.errors import InputError, UnobservableError
 from rigwake.geometry.se3 import SE3
 from rigwake.pipeline.prior import RigPrior
 from rigwake.pipeline.stream_selection import Selection
+from rigwake.plausibility.noise_bounds import check_imu_noise
+from rigwake.plausibility.values import SensorCheck, refuse
 from rigwake.recording import Recording, static_transform
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
@@ -41,6 +43,7 @@ class RigEstimate:
     calibration: Calibration
     adjusted: AdjustedRig
     matches: CrossCameraMatches
+    sensor_checks: tuple[SensorCheck, ...] = ()
 
 
 def initialise_rig(
@@ -87,8 +90,18 @@ def estimate_rig(
     reference = replace(
         reference_frame(recording, selection, first, config.reference), is_metric=first.scale_source != "none"
     )
+    checks = _noise_checks(selection, adjusted) if config.sensor_checks else ()
+    refuse(checks)
     calibration = _conclude(selection, first, adjusted, matches, reference, config)
-    return RigEstimate(calibration, adjusted, matches)
+    return RigEstimate(calibration, adjusted, matches, checks)
+
+
+def _noise_checks(selection: Selection, adjusted: AdjustedRig) -> tuple[SensorCheck, ...]:
+    imu = selection.imu
+    if imu is None or imu.gyro_noise_density is None or imu.accel_noise_density is None:
+        return ()
+    stated = {"gyro": imu.gyro_noise_density, "accel": imu.accel_noise_density}
+    return check_imu_noise(imu_noise_factors(imu, adjusted.solution.problem.imu), stated)
 
 
 def _adjust(

@@ -51,6 +51,7 @@ def judge(calibration: Calibration) -> ReportVerdict:
     reasons = [
         *lost,
         *_estimation(calibration.checks),
+        *_sensors(calibration.checks),
         *_precision(calibration),
         _split_half(calibration.checks),
         _association(calibration.checks),
@@ -87,6 +88,23 @@ def _estimation(checks: Mapping[str, Any]) -> list[Reason]:
                 False, "The adjustment did not settle.", "Look at the residuals over time and at the masks."
             )
         )
+    return reasons
+
+
+def _sensors(checks: Mapping[str, Any]) -> list[Reason]:
+    """Whether every sensor agrees with the others; cameras that were left out are told by `_estimation`."""
+    found = checks.get("sensor_checks")
+    if not isinstance(found, list) or not all(isinstance(check, Mapping) for check in found):
+        return []
+    reasons = []
+    for check in found:
+        words = f"{check.get('sensor')}: {check.get('hypothesis')}"
+        if check.get("action") == "left out" and not str(check.get("sensor")).startswith("camera "):
+            reasons.append(Reason(False, f"Left out, {words}", str(check.get("remedy") or "")))
+        elif check.get("action") == "repaired":
+            reasons.append(Reason(True, f"Repaired, {words}", str(check.get("remedy") or "")))
+    if not any(not check.get("agrees") for check in found):
+        reasons.append(Reason(True, f"Every sensor agrees with the others ({len(found)} comparisons)."))
     return reasons
 
 

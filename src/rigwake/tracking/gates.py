@@ -72,7 +72,7 @@ def believed(seen: Registration, shown: StreamQuality, options: TrackingOptions)
 
     The bound of the options is on the correlation that there would be without the noise of the stream.
     """
-    good = seen.found & (doubts(seen, shown, options) <= 1)
+    good = seen.found & (gate_ratios(seen, shown, options) <= 1)
     stretch = np.linalg.svd(seen.warps, compute_uv=False)
     good &= seen.correlation >= min(_LEAST_CORRELATION, options.min_correlation)
     good &= seen.std_px <= largest_std_px(shown, options)
@@ -80,7 +80,7 @@ def believed(seen: Registration, shown: StreamQuality, options: TrackingOptions)
     return np.asarray(good)
 
 
-def doubts(seen: Registration, shown: StreamQuality, options: TrackingOptions) -> Array:
+def gate_ratios(seen: Registration, shown: StreamQuality, options: TrackingOptions) -> Array:
     """(N,) residuals beyond the noise of the stream, by those that the options allow; above 1 is not believed."""
     with np.errstate(divide="ignore", invalid="ignore"):
         against_signal = 1 / np.square(seen.correlation) - 1

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rigwake._types import Array, Image, Mask
 from rigwake.cameras.protocol import CameraModel
 from rigwake.tracking.features import detect_corners
-from rigwake.tracking.gates import StreamQuality, believed, doubts, largest_std_px
+from rigwake.tracking.gates import StreamQuality, believed, gate_ratios, largest_std_px
 from rigwake.tracking.interpolation import Coefficients, spline_coefficients
 from rigwake.tracking.klt import Pyramid, follow, pyramid
 from rigwake.tracking.masks import inside
@@ -57,7 +57,7 @@ class _Live:
     image_from_reference: Array
     references: References
     ages: NDArray[np.int64]
-    doubts: Array
+    gate_ratios: Array
 
     def take(self, index: Mask | NDArray[np.int64]) -> _Live:
         return _Live(*(_taken(getattr(self, f.name), index) for f in fields(self)))
@@ -156,16 +156,16 @@ class KltFrontEnd:
         fresh = seen.found & (live.ages == 0)
         self.shown = self.shown.with_residuals(seen.noise[fresh] ** 2, seen.std_px[fresh])
         good &= believed(seen, self.shown, options)
-        found = replace(found, doubts=doubts(seen, self.shown, options))
+        found = replace(found, gate_ratios=gate_ratios(seen, self.shown, options))
         self.shown = self.shown.with_losses(~good[live.ages > 0])
         # only a position that was still good is handed on, the better the longer patches serve
-        lost = ~good & (live.ages > 0) & (live.doubts < self.shown.haste)
+        lost = ~good & (live.ages > 0) & (live.gate_ratios < self.shown.haste)
         found = found.take(good)
         if lost.any():
             renewed, textured = self._renewed(self.last, live.take(lost))
             predicted, bearings = predicted[lost][textured], bearings[lost][textured]
             again, seen, good = self._register(now, renewed, predicted, bearings, turn)
-            again = replace(again, doubts=doubts(seen, self.shown, options))
+            again = replace(again, gate_ratios=gate_ratios(seen, self.shown, options))
             again = again.take(good & believed(seen, self.shown, options))
             found = found.join(again)
             found = found.take(np.argsort(found.ids))

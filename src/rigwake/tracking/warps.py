@@ -14,7 +14,7 @@ from numba import njit
 
 from rigwake._types import Array, Mask
 from rigwake.geometry import so3
-from rigwake.tracking.picture_scale import Rays
+from rigwake.tracking.picture_scale import ScaledRays
 
 _STENCIL_PX = 2.0
 _STENCIL = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [0, 0]]) * _STENCIL_PX
@@ -60,7 +60,7 @@ def _kabsch(before: Array, after: Array) -> Array:
     return rotation
 
 
-def stencil_bearings(model: Rays, pixels: Array) -> tuple[Array, Mask]:
+def stencil_bearings(model: ScaledRays, pixels: Array) -> tuple[Array, Mask]:
     """Bearings (N, 7, 3) of pixels (N, 2) and of six pixels about each of them, and validity (N,).
 
     These are 2 px to the right, left, below and above, on the diagonal to the lower right and upper left, and the
@@ -74,7 +74,7 @@ def stencil_bearings(model: Rays, pixels: Array) -> tuple[Array, Mask]:
 
 
 def rotation_warps(
-    model: Rays, reference_stencils: Array, after_from_reference: Array, bearings_after: Array
+    model: ScaledRays, reference_stencils: Array, after_from_reference: Array, bearings_after: Array
 ) -> tuple[Array, Array, Mask]:
     """Warps of patches by the turn of the camera: affine (N, 2, 2), their bends (N, 2, 3), and validity (N,).
 

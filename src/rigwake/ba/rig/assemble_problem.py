@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake._types import Array, Indices
+from rigwake.ba.rig.gnss_noise import with_receiver_errors
 from rigwake.ba.rig.rig_values import AdjustmentOptions, AssembledProblem, InitialValues, RigMeasurements
 from rigwake.ba.solver.rig_problem import (
     Antenna,
@@ -15,6 +16,7 @@ from rigwake.ba.solver.rig_problem import (
     Observations,
     RigProblem,
     States,
+    VectorPrior,
 )
 from rigwake.errors import EstimationError
 from rigwake.geometry.interpolate import TransformSpline, interpolate
@@ -22,6 +24,7 @@ from rigwake.geometry.triangulation import triangulate_rays
 from rigwake.tracks import Tracks
 
 _CELLS = 6  # the image is divided into this many columns and rows when tracks are chosen
+_RECEIVER_DELAY_STD_S = 0.1
 _DEFAULT_RANGE_M = 30.0  # of points without parallax: far enough to be smooth, near enough to move
 
 
@@ -47,10 +50,18 @@ def assemble_problem(
         observations=observations,
         imu=measurements.imu,
         gnss=measurements.gnss,
-        antenna=Antenna(start.antenna_rig, free=measurements.gnss is not None),
+        antenna=_antenna(measurements, start),
         attitude=measurements.attitude,
     )
-    return AssembledProblem(problem, track_cameras, track_ids)
+    return AssembledProblem(with_receiver_errors(problem), track_cameras, track_ids)
+
+
+def _antenna(measurements: RigMeasurements, start: InitialValues) -> Antenna:
+    """The antenna, and with an IMU the receiver's delay, which is known to be small once it was looked for."""
+    if measurements.gnss is None or measurements.imu is None:
+        return Antenna(start.antenna_rig, free=measurements.gnss is not None)
+    delay = VectorPrior.from_std(0.0, _RECEIVER_DELAY_STD_S)
+    return Antenna(start.antenna_rig, free=True, time_offset_prior=delay)
 
 
 def state_times(

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigwake._types import Array
+from rigwake.ba.rig.gnss_noise import with_learnt_receiver_errors
 from rigwake.ba.rig.imu_noise import imu_noise_scales, with_imu_noise
 from rigwake.ba.rig.rig_values import AdjustedRig, AdjustmentOptions, AssembledProblem
 from rigwake.ba.solver.levenberg_marquardt import solve
@@ -55,6 +56,7 @@ def adjust(
         gate = options.gate_stds * (_FIRST_GATE if done == 0 else 1.0)
         problem, kept, scales, lost = drop_outliers(solution, gate, options.min_observations)
         problem = with_imu_noise(problem, imu_noise_scales(solution))
+        problem = with_learnt_receiver_errors(problem)
         factors *= scales
         dropped += lost
         cameras, ids = cameras[kept], ids[kept]

@@ -17,6 +17,7 @@ from rigwake.ba.solver.rig_problem import (
     CameraBaseline,
     CameraDistance,
     DistanceMeasurement,
+    LastingErrors,
     PosePrior,
     RelativeMeasurements,
     RigProblem,
@@ -41,6 +42,8 @@ def measured_factors(
     """All factors of the problem but pixels and inertial ones."""
     if problem.gnss is not None:
         yield gnss_factors(problem, layout, options)
+        if problem.antenna.errors is not None:
+            yield from lasting_error_factors(problem.antenna.errors, layout)
     if problem.attitude is not None:
         yield attitude_factors(problem, layout)
     if problem.poses is not None:
@@ -73,22 +76,34 @@ def _whitened(residuals: Array, jacobian: Array, columns: Indices, whiten: Array
 
 
 def gnss_factors(problem: RigProblem, layout: ParameterLayout, options: SolverOptions) -> Factors:
-    """Antenna positions, with Huber's loss: `world_from_rig(t) * antenna - fix`."""
-    gnss = problem.gnss
+    """Antenna positions, with Huber's loss: `world_from_rig(t + offset) * antenna + lasting error - fix`."""
+    gnss, antenna = problem.gnss, problem.antenna
     assert gnss is not None
-    kept = inside_states(problem, gnss.timestamps_ns)
-    times = seconds_since_start(problem, gnss.timestamps_ns[kept])
-    arm = problem.antenna.position_rig
-    rig = rig_at(problem, layout, times, nearest_states(problem, times), moving=False)
+    kept, shift_ns = fixes_inside(problem)
+    times = seconds_since_start(problem, gnss.timestamps_ns[kept] + shift_ns)
+    times = times + (antenna.time_offset_s - shift_ns * 1e-9)
+    arm = antenna.position_rig
+    moving = antenna.time_offset_prior is not None
+    rig = rig_at(problem, layout, times, nearest_states(problem, times), moving=moving)
     rotation = rig.world_from_body.rotation
     by_pose = np.concatenate([-rotation @ so3.hat(arm), rotation], axis=2)
     chained, columns = rig.chain(layout)
-    jacobian = by_pose @ chained
-    if problem.antenna.free:
+    parts, blocks = [by_pose @ chained], [columns]
+    if antenna.free:
         own = layout.shared_columns("antenna", "position_rig", 3)
-        jacobian = np.concatenate([jacobian, rotation], axis=2)
-        columns = np.concatenate([columns, np.broadcast_to(own, (len(columns), 3))], axis=1)
+        parts.append(rotation)
+        blocks.append(np.broadcast_to(own, (len(columns), 3)))
+    if moving:
+        own = layout.shared_columns("antenna", "time_offset", 1)
+        parts.append(by_pose @ rig.twist[:, :, None])
+        blocks.append(np.broadcast_to(own, (len(columns), 1)))
     residuals = rig.world_from_body * arm - gnss.position_enu[kept]
+    if antenna.errors is not None:
+        error, by_nodes, own = _lasting_error(antenna.errors, layout, gnss.timestamps_ns[kept])
+        residuals = residuals + error
+        parts.append(by_nodes)
+        blocks.append(own)
+    jacobian, columns = np.concatenate(parts, axis=2), np.concatenate(blocks, axis=1)
     plain = _whitened(residuals, jacobian, columns, whitening(gnss.covariances[kept]))
     squared = np.sum(plain.residuals**2, axis=1)
     loss, slope = robust(squared, "huber", options.gnss_loss_scale)
@@ -99,6 +114,51 @@ def gnss_factors(problem: RigProblem, layout: ParameterLayout, options: SolverOp
         columns,
         0.5 * float(loss.sum()),
     )
+
+
+def fixes_inside(problem: RigProblem) -> tuple[Mask, int]:
+    """(G,) fixes that take part, and the time offset (ns) that decides it: it stays while the estimate moves."""
+    gnss, antenna = problem.gnss, problem.antenna
+    assert gnss is not None
+    known = antenna.time_offset_prior
+    shift_ns = round(1e9 * (antenna.time_offset_s if known is None else float(known.mean[0])))
+    return inside_states(problem, gnss.timestamps_ns + shift_ns), shift_ns
+
+
+def _lasting_error(
+    errors: LastingErrors, layout: ParameterLayout, at_ns: Indices
+) -> tuple[Array, Array, Indices]:
+    """The error (n, 3) at these stamps, its derivative (n, 3, 6) by the two nodes around, and their columns (n, 6)."""
+    nodes = errors.timestamps_ns
+    own = layout.shared_columns("antenna", "errors", 3 * len(nodes)).reshape(-1, 3)
+    if len(nodes) == 1:
+        by_node = np.broadcast_to(np.eye(3), (len(at_ns), 3, 3))
+        return (
+            np.broadcast_to(errors.values_enu, (len(at_ns), 3)),
+            by_node,
+            np.broadcast_to(own, (len(at_ns), 3)),
+        )
+    left = np.clip(np.searchsorted(nodes, at_ns, side="right") - 1, 0, len(nodes) - 2)
+    fraction = (at_ns - nodes[left]) / (nodes[left + 1] - nodes[left]).astype(np.float64)
+    fraction = np.clip(fraction, 0.0, 1.0)[:, None]
+    error = (1 - fraction) * errors.values_enu[left] + fraction * errors.values_enu[left + 1]
+    by_nodes = np.concatenate([(1 - x)[..., None] * np.eye(3) for x in (fraction, 1 - fraction)], axis=2)
+    return error, by_nodes, np.concatenate([own[left], own[left + 1]], axis=1)
+
+
+def lasting_error_factors(errors: LastingErrors, layout: ParameterLayout) -> Iterator[Factors]:
+    """The Gauss-Markov process itself: `e_0 ~ N(0, s^2)`, `e_k - rho e_(k-1) ~ N(0, s^2 (1 - rho^2))`,
+    `rho = exp(-dt / tau)`."""
+    nodes, values = errors.timestamps_ns, errors.values_enu
+    own = layout.shared_columns("antenna", "errors", 3 * len(nodes)).reshape(-1, 3)
+    root = np.diag(1 / errors.std)
+    yield _whitened(values[:1], np.eye(3)[None], own[:1], root[None])
+    if len(nodes) > 1:
+        rho = np.exp(-np.diff(nodes) * 1e-9 / errors.correlation_s)[:, None]
+        jacobian = np.concatenate([-rho[..., None] * np.eye(3), np.tile(np.eye(3), (len(rho), 1, 1))], axis=2)
+        columns = np.concatenate([own[:-1], own[1:]], axis=1)
+        whiten = root / np.sqrt(1 - rho[..., None] ** 2)
+        yield _whitened(values[1:] - rho * values[:-1], jacobian, columns, whiten)
 
 
 def attitude_factors(problem: RigProblem, layout: ParameterLayout) -> Factors:
@@ -219,10 +279,13 @@ def _prior_factors(problem: RigProblem, layout: ParameterLayout) -> Iterator[Fac
                 yield _vector_prior(np.atleast_1d(value), prior, columns)
     for owner, kind, value, prior in (
         ("antenna", "position_rig", problem.antenna.position_rig, problem.antenna.prior),
+        ("antenna", "time_offset", problem.antenna.time_offset_s, problem.antenna.time_offset_prior),
         ("gravity", "acceleration_world", problem.gravity.acceleration_world, problem.gravity.prior),
     ):
         if prior is not None and (owner, kind) in layout.shared:
-            yield _vector_prior(value, prior, layout.shared_columns(owner, kind, 3))
+            yield _vector_prior(
+                np.atleast_1d(value), prior, layout.shared_columns(owner, kind, len(prior.mean))
+            )
 
 
 def coupled_states(problem: RigProblem) -> Indices:

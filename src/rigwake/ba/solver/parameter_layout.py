@@ -60,6 +60,11 @@ def layout_of(problem: RigProblem) -> ParameterLayout:
         n_params = len(camera.model.params)
         extras += [((camera.name, "intrinsics"), n_params)] if "intrinsics" in camera.free else []
     widths += [(("antenna", "position_rig"), 3)] if problem.antenna.free and problem.gnss else []
+    if problem.gnss is not None:
+        receiver = problem.antenna
+        widths += [(("antenna", "time_offset"), 1)] if receiver.time_offset_prior is not None else []
+        if receiver.errors is not None:
+            widths += [(("antenna", "errors"), 3 * len(receiver.errors.timestamps_ns))]
     widths += [(("gravity", "acceleration_world"), 3)] if problem.gravity.free and problem.imu else []
     extras_start = n * dim + sum(width for _, width in widths)
     shared, start = {}, n * dim
@@ -88,6 +93,11 @@ def retract(
     antenna, gravity = problem.antenna, problem.gravity
     if block := layout.shared.get(("antenna", "position_rig")):
         antenna = replace(antenna, position_rig=antenna.position_rig + step[block])
+    if block := layout.shared.get(("antenna", "time_offset")):
+        antenna = replace(antenna, time_offset_s=antenna.time_offset_s + float(step[block][0]))
+    if (block := layout.shared.get(("antenna", "errors"))) and antenna.errors is not None:
+        values = antenna.errors.values_enu + step[block].reshape(-1, 3)
+        antenna = replace(antenna, errors=replace(antenna.errors, values_enu=values))
     if block := layout.shared.get(("gravity", "acceleration_world")):
         gravity = replace(gravity, acceleration_world=gravity.acceleration_world + step[block])
     return replace(

@@ -21,6 +21,7 @@ from rigwake.ba.solver.rig_problem import RigProblem
 from rigwake.errors import UsageError
 from rigwake.recording import ImuStream
 
+_LONGEST_BRIDGE_S = 5.0
 _GAP = 2.5  # a step longer than this many median steps is a gap
 
 
@@ -76,14 +77,32 @@ def imu_noise(imu: ImuStream) -> ImuNoiseModel:
 
 
 def gap_walks(imu: ImuStream) -> tuple[Array, float]:
-    """(2,) intensity of a Wiener process that changes as fast as gyro and accelerometer do (per axis rms of
-    successive samples), and the step length (s) above which samples count as missing."""
+    """(2,) intensity of a Wiener process that leaves as much across the longest gap as gyro and accelerometer leave of
+    themselves when they are bridged by a straight line elsewhere, and the step length (s) above which samples count as
+    missing.
+
+    A Brownian bridge over L integrates to a variance of `w L^3 / 12`: w follows from what straight lines over stretches
+    of that length miss in the rest of the recording, and is at least what successive samples show.
+    """
     steps = np.diff(imu.timestamps_ns) * 1e-9
     usual = float(np.median(steps))
     regular = steps <= _GAP * usual
-    return np.array(
-        [np.mean(np.diff(signal, axis=0)[regular] ** 2) / usual for signal in (imu.gyro, imu.accel)]
-    ), _GAP * usual
+    signals = (imu.gyro, imu.accel)
+    walks = np.array([np.mean(np.diff(signal, axis=0)[regular] ** 2) / usual for signal in signals])
+    if regular.all():
+        return walks, _GAP * usual
+    length = round(min(float(steps.max()), _LONGEST_BRIDGE_S) / usual)
+    seconds = length * usual
+    broken = np.concatenate([[0], np.cumsum(~regular)])
+    for k, signal in enumerate(signals):
+        starts = np.arange(0, len(signal) - length, max(length // 4, 1))
+        starts = starts[broken[starts + length] == broken[starts]]
+        if len(starts) and length > 1:
+            total = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (signal[1:] + signal[:-1]), axis=0)])
+            whole = (total[starts + length] - total[starts]) * usual
+            missed = whole - 0.5 * (signal[starts] + signal[starts + length]) * seconds
+            walks[k] = max(walks[k], float(np.mean(missed**2)) * 12 / seconds**3)
+    return walks, _GAP * usual
 
 
 def preintegrate(problem: RigProblem, starts_s: Array, ends_s: Array, states: Indices) -> Preintegrated:
@@ -296,7 +315,9 @@ def _step_noise(noise, size, sample_step, B):  # type: ignore[no-untyped-def]
     """B (9,): what sensor noise adds in a step of this size (s); across a gap, what the signal may have done unseen."""
     gyro_bridge, accel_bridge = 0.0, 0.0
     if sample_step > noise[4]:
-        gyro_bridge, accel_bridge = noise[2] * size**3 / 12, noise[3] * size**3 / 12
+        # a piece of a bridge misses what the whole does, in proportion to its length
+        gyro_bridge = noise[2] * sample_step**2 * size / 12
+        accel_bridge = noise[3] * sample_step**2 * size / 12
     for i in range(3):
         B[i] = noise[0] * size + gyro_bridge
         B[3 + i] = noise[1] * size + accel_bridge

@@ -191,11 +191,32 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class Antenna:
-    """The GNSS antenna: `position_rig` (3,), held unless `free`."""
+    """The GNSS antenna: `position_rig` (3,), held unless `free`, and the receiver's clock and errors.
+
+    time_offset_s: `t_rig = t_gnss + time_offset_s`; a receiver that stamps late has a negative one. Estimated where
+    there is a `time_offset_prior`. errors: what lasts in its positions, None where they are independent.
+    """
 
     position_rig: Array
     free: bool = False
     prior: VectorPrior | None = None
+    time_offset_s: float = 0.0
+    time_offset_prior: VectorPrior | None = None
+    errors: LastingErrors | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LastingErrors:
+    """A receiver's errors that last, as a Gauss-Markov process of first order per axis: unknowns at K nodes.
+
+    timestamps_ns: (K,) of the nodes on the receiver's clock. values_enu: (K, 3) metres, linear in between.
+    std: (3,) stationary standard deviation per axis. correlation_s: time over which the correlation falls to 1/e.
+    """
+
+    timestamps_ns: Indices
+    values_enu: Array
+    std: Array
+    correlation_s: float
 
 
 @dataclass(frozen=True, eq=False)

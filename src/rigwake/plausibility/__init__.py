@@ -1,0 +1,1 @@
+"""Does a sensor agree with the others? Pure functions that answer with a `SensorCheck`."""

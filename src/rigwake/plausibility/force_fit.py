@@ -1,0 +1,137 @@
+"""The accelerometer against gravity and vision: which axes, signs and unit make it agree.
+
+With a camera's positions `c` up to scale, its rotations, and `R` of the IMU, second differences over half a second
+obey, whatever the path,
+
+    s D2 c + D2 R l = K * (R (P a - b)) + g h^2
+
+where `K` is the triangle of width h that a second difference makes of an acceleration, and scale s, gravity g, lever
+arm l and bias b are linear unknowns. P is what the accelerometer's axes, signs and unit are suspected to be; every P is
+tried, and the one that leaves least is right. Nothing but the bias is believed beforehand: g may have any length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import permutations, product
+
+import numpy as np
+
+from rigwake._types import Array, Stamps
+from rigwake.errors import UnobservableError
+from rigwake.geometry.interpolate import interpolate
+from rigwake.odometry.gyro import integrate_gyro
+from rigwake.plausibility.turn_fit import TurnFit
+from rigwake.recording import ImuStream
+from rigwake.trajectory import Trajectory
+
+GRAVITY = 9.80665
+_H_S = 0.5
+_BIAS_STD, _LEVER_STD = 0.3, 5.0
+_FEWEST = 16
+
+
+@dataclass(frozen=True, eq=False)
+class ForceFit:
+    """How the specific force compares with vision, for one suspected reading of the axes.
+
+    axes: (3, 3) P. scale: metres per visual unit, with scale_std relative to it. gravity: (3,) m/s^2 in the visual
+    world. left: root mean square of what is not explained, m/s^2. moved: that of the accelerations themselves without
+    gravity, m/s^2: what there is to explain.
+    """
+
+    axes: Array
+    scale: float
+    scale_std: float
+    gravity: Array
+    left: float
+    moved: float
+
+
+def signed_permutations() -> tuple[Array, ...]:
+    """All 48 ways to exchange and flip three axes, the identity first."""
+    found = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            axes = np.zeros((3, 3))
+            axes[range(3), order] = signs
+            found.append(axes)
+    return tuple(found)
+
+
+class ForceEquations:
+    """The linear system of one camera's main segment, made once and solved for every suspected reading.
+
+    Raises UnobservableError where the segment and the IMU share less than about nine seconds.
+    """
+
+    def __init__(self, trajectory: Trajectory, imu: ImuStream, turns: TurnFit) -> None:
+        path = longest_segment(trajectory)
+        on_imu = path.timestamps_ns + round(turns.time_offset_s * 1e9)
+        first = max(int(on_imu[0]), int(imu.timestamps_ns[0])) + round((_H_S + 0.05) * 1e9)
+        last = min(int(on_imu[-1]), int(imu.timestamps_ns[-1])) - round((_H_S + 0.05) * 1e9)
+        centres = np.arange(first, last, round(0.5 * _H_S * 1e9))
+        if len(centres) < _FEWEST:
+            raise UnobservableError(f"{trajectory.name}: too short together with {imu.name}.")
+        h = round(_H_S * 1e9)
+        shift = round(turns.time_offset_s * 1e9)
+        at = [
+            interpolate(path.timestamps_ns, path.world_from_body, centres + k * h - shift) for k in (-1, 0, 1)
+        ]
+        self.unit = max(float(np.abs(path.world_from_body.translation).max()), 1e-12)
+        rate = replace(imu, gyro=imu.gyro * turns.scale)
+        turned = integrate_gyro(rate, turns.gyro_bias * turns.scale)
+        imu_from_cam = turns.imu_from_cam
+        # rotations of the IMU in the visual world: by the gyroscope, anchored to vision in the middle
+        self.to_world = np.swapaxes(turned.at(centres), 1, 2)
+        self.to_world = at[1].rotation @ imu_from_cam.T @ self.to_world
+        self.path_term = (at[0].translation - 2 * at[1].translation + at[2].translation) / _H_S**2
+        self.lever_term = (at[0].rotation - 2 * at[1].rotation + at[2].rotation) / _H_S**2
+        self._integrals(imu, turned.rotation, centres)
+
+    def _integrals(self, imu: ImuStream, start_from_imu: Array, centres: Stamps) -> None:
+        """Forces and rotations under the triangle round every centre: (N, 3, 3, 3) and (N, 3, 3)."""
+        n = len(centres)
+        self.force, self.bias = np.empty((n, 3, 3, 3)), np.empty((n, 3, 3))
+        times = (imu.timestamps_ns - imu.timestamps_ns[0]) * 1e-9
+        for k, centre in enumerate((centres - imu.timestamps_ns[0]) * 1e-9):
+            i, j = np.searchsorted(times, [centre - _H_S, centre + _H_S])
+            weights = np.maximum(_H_S - np.abs(times[i:j] - centre), 0.0)
+            weights /= max(weights.sum(), 1e-12)
+            R = self.to_world[k] @ start_from_imu[i:j]
+            # [axis of the world, axis of the IMU that P puts it on, axis that was read]
+            self.force[k] = np.einsum("t,tax,ty->axy", weights, R, imu.accel[i:j])
+            self.bias[k] = np.einsum("t,tax->ax", weights, R)
+
+    def solve(self, axes: Array) -> ForceFit:
+        """The least that this reading of the axes leaves, robustly."""
+        n = len(self.force)
+        right = np.einsum("naxy,xy->na", self.force, axes).reshape(-1)
+        columns = np.zeros((n, 3, 10))
+        columns[:, :, 0] = self.path_term
+        columns[:, :, 1:4] = -np.eye(3)
+        columns[:, :, 4:7] = self.lever_term
+        columns[:, :, 7:] = self.bias
+        A = columns.reshape(-1, 10)
+        prior = np.zeros(10)
+        weights, x, size, H = np.ones(n), np.zeros(10), 0.1, np.eye(10)
+        for _ in range(8):
+            prior[4:7], prior[7:] = (size / _LEVER_STD) ** 2, (size / _BIAS_STD) ** 2
+            w = np.repeat(weights, 3)
+            H = (A * w[:, None]).T @ A + np.diag(prior) + 1e-12 * np.eye(10) * self.unit**2
+            x = np.linalg.solve(H, A.T @ (w * right))
+            off = np.linalg.norm((A @ x - right).reshape(-1, 3), axis=1)
+            size = max(float(np.median(off)) / 1.54, 1e-4)
+            weights = 1 / (1 + (off / (3 * size)) ** 2)
+        moved = (self.path_term * x[0]).reshape(-1, 3)
+        # second differences overlap: neighbouring rows are not independent
+        std = size * np.sqrt(2.0 * np.linalg.inv(H)[0, 0]) / max(abs(x[0]), 1e-12)
+        rms = float(np.sqrt(np.mean(np.minimum(off, 4 * size) ** 2) / 3))
+        return ForceFit(axes, float(x[0]), float(std), x[1:4], rms, float(np.sqrt(np.mean(moved**2))))
+
+
+def longest_segment(trajectory: Trajectory) -> Trajectory:
+    """The segment with the most poses."""
+    ids = trajectory.segment_ids
+    assert ids is not None
+    return trajectory.take(np.flatnonzero(ids == np.argmax(np.bincount(ids))))

@@ -1,0 +1,279 @@
+"""A GNSS receiver, judged by the cameras' path: axes, scale, delay, jumps, fixes that stand still, outliers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigwake._types import Array
+from rigwake.errors import UnobservableError
+from rigwake.plausibility.receiver_fit import ReceiverFit, axis_confusions, fit_receiver, frozen_rows
+from rigwake.plausibility.values import SensorCheck
+from rigwake.recording import GnssStream
+from rigwake.trajectory import Trajectory
+
+_DRIFT = 0.01  # of the path: what a camera's own path may be off
+_STDS = 4.0
+_CLEARLY_BETTER = 0.35
+_DELAY_S, _DELAY_SIGMAS = 0.05, 4.0
+_OUTLIER_STDS = 8.0
+_LEAST_JUMP_M, _JUMP_STDS = 0.5, 8.0
+_FEWEST = 12
+_STANDING_S, _LEAST_WAY_M = 2.0, 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class VettedReceiver:
+    """The fixes to use (None: none), the delay found beyond the IMU's clock, the last fit, and the checks."""
+
+    gnss: GnssStream | None
+    delay_s: float
+    fit: ReceiverFit | None
+    checks: tuple[SensorCheck, ...]
+
+
+def vet_receiver(
+    gnss: GnssStream,
+    path: Trajectory,
+    time_offset_s: float,
+    *,
+    level: bool,
+    inertial_scale: tuple[float, float] | None = None,
+    repair: bool = True,
+) -> VettedReceiver:
+    """Compare a receiver with a camera's path, leave out fixes that cannot be right, and name what is wrong.
+
+    path: one segment, level if `level` (else the sense of rotation cannot be told), up to scale. time_offset_s: of the
+    camera to the IMU. inertial_scale: metres per unit of the path by the accelerometer, and how far it may be off,
+    relative to it.
+    """
+    sensor = f"gnss {gnss.name}"
+    checks: list[SensorCheck] = []
+    try:
+        gnss, found = _without_frozen(gnss, path, time_offset_s, repair)
+        checks += found
+        gnss, found = _without_standing(gnss, path, time_offset_s, repair)
+        checks += found
+        gnss, found = _without_jumps(gnss, path, time_offset_s, repair)
+        checks += found
+        fit = fit_receiver(path, gnss, gnss.position_enu, time_offset_s=time_offset_s)
+    except UnobservableError as error:
+        return VettedReceiver(gnss, 0.0, None, (*checks, SensorCheck(sensor, True, 0.0, 0.0, error.cause)))
+    expected = _expected(gnss, fit)
+    quantity = "horizontal distance of fixes to the cameras' path, m"
+    if fit.rms > expected:
+        words, remedy = _confusion(gnss, path, time_offset_s, fit) if level else ("", "")
+        words = words or (
+            f"its fixes lie {fit.rms:.2f} m (per axis) off the path that cameras and IMU see, where at most "
+            f"{expected:.2f} m is to be expected"
+        )
+        remedy = (
+            remedy
+            or "Check its positions on a map, its stamps and its antenna; or leave it out (--set gnss=false)."
+        )
+        check = SensorCheck(sensor, False, fit.rms, expected, f"{words}.", remedy, quantity)
+        return VettedReceiver(None, 0.0, fit, (*checks, check))
+    ratio = 1.0 if inertial_scale is None else fit.scale / inertial_scale[0]
+    if inertial_scale is not None and abs(ratio - 1) > inertial_scale[1] + 5 * fit.scale_std:
+        words = f"its distances are {ratio:.3f} times those by the accelerometer."
+        check = SensorCheck(
+            sensor, False, ratio, 1.0, words, "Check the unit and datum of its positions.",
+            "scale against the accelerometer",
+        )  # fmt: skip
+        return VettedReceiver(None, 0.0, fit, (*checks, check))
+    gnss, found = _without_outliers(gnss, fit, repair)
+    checks += found
+    late = abs(fit.lag_s) > max(_DELAY_S, _DELAY_SIGMAS * fit.lag_std_s)
+    words = (
+        f"its fixes are {1e3 * fit.lag_s:+.0f} ± {1e3 * fit.lag_std_s:.0f} ms late; estimated with the rig."
+        if late
+        else ""
+    )
+    checks.append(SensorCheck(sensor, True, fit.rms, expected, words, "", quantity))
+    return VettedReceiver(gnss, fit.lag_s if late else 0.0, fit, tuple(checks))
+
+
+def _expected(gnss: GnssStream, fit: ReceiverFit) -> float:
+    """Horizontal distance per axis that the stated covariance and the drift of a camera's path allow, metres."""
+    stated = float(np.sqrt(np.median(gnss.covariances[:, [0, 1], [0, 1]])))
+    return _STDS * stated + _DRIFT * fit.path_m + 0.1
+
+
+def _confusion(
+    gnss: GnssStream, path: Trajectory, time_offset_s: float, given: ReceiverFit
+) -> tuple[str, str]:
+    """What makes the fixes agree with the path, in words, and the remedy; nothing where nothing does."""
+    left: dict[str, float] = {}
+    for words, positions in axis_confusions(gnss).items():
+        try:
+            left[words] = fit_receiver(path, gnss, positions, time_offset_s=time_offset_s).rms
+        except UnobservableError:
+            continue
+    if not left:
+        return "", ""
+    best = min(left, key=lambda words: left[words])
+    if left[best] > _CLEARLY_BETTER * given.rms:
+        return "", ""
+    words = f"{best}: its fixes lie {given.rms:.2f} m off the cameras' path as recorded, {left[best]:.2f} m corrected"
+    return words, "Correct the order and signs of its coordinates."
+
+
+def _without_frozen(
+    gnss: GnssStream, path: Trajectory, time_offset_s: float, repair: bool
+) -> tuple[GnssStream, list[SensorCheck]]:
+    """Without fixes that repeat the one before to the last digit while the path goes on: a vessel may lie still."""
+    frozen = frozen_rows(gnss)
+    if not frozen.any():
+        return gnss, []
+    moving = take_fixes(gnss, ~frozen)
+    fit = fit_receiver(path, moving, moving.position_enu, time_offset_s=time_offset_s)
+    expected = moving.position_enu[fit.rows, :2] - fit.residuals[:, :2]
+    times = moving.timestamps_ns[fit.rows]
+    starts = np.flatnonzero(frozen & ~np.concatenate([[False], frozen[:-1]]))
+    for first in starts.tolist():
+        last = first + int(np.argmin(np.append(frozen[first:], False)))
+        before = np.searchsorted(times, gnss.timestamps_ns[first]) - 1
+        after = np.searchsorted(times, gnss.timestamps_ns[last - 1])
+        inside = before >= 0 and after < len(times)
+        if inside and np.linalg.norm(expected[after] - expected[before]) < _LEAST_WAY_M:
+            frozen[first:last] = False
+    if not frozen.any():
+        return gnss, []
+    at = (gnss.timestamps_ns[int(np.argmax(frozen))] - gnss.timestamps_ns[0]) * 1e-9
+    words = f"{int(frozen.sum())} fixes from {at:.1f} s on repeat the one before to the last digit"
+    return _reduced(gnss, ~frozen, words, "Check the receiver: it repeats its last fix.", repair)
+
+
+def _without_standing(
+    gnss: GnssStream, path: Trajectory, time_offset_s: float, repair: bool
+) -> tuple[GnssStream, list[SensorCheck]]:
+    """Without fixes that stay where they are, but for noise, while the path goes on."""
+    fit = fit_receiver(path, gnss, gnss.position_enu, time_offset_s=time_offset_s)
+    fixes = gnss.position_enu[fit.rows, :2]
+    expected = fixes - fit.residuals[:, :2]
+    times = (gnss.timestamps_ns[fit.rows] - gnss.timestamps_ns[0]) * 1e-9
+    standing = np.zeros(len(fixes), dtype=bool)
+    ahead = np.searchsorted(times, times + _STANDING_S)
+    for k, j in enumerate(ahead):
+        if j >= len(times):
+            break
+        way = float(np.linalg.norm(expected[j] - expected[k]))
+        held = float(np.linalg.norm(fixes[j] - fixes[k])) < 0.1 * way
+        if held and way > max(_LEAST_WAY_M, 6 * _white_noise(gnss)):
+            standing[k : j + 1] = True
+    if standing.mean() > 0.6 or not standing.any():
+        return gnss, []
+    kept = np.ones(len(gnss.timestamps_ns), dtype=bool)
+    kept[fit.rows[standing]] = False
+    begin = times[int(np.argmax(standing))]
+    words = f"{int(standing.sum())} fixes from {begin:.1f} s on stand still while the cameras move"
+    return _reduced(gnss, kept, words, "Check the receiver: it repeats its last fix.", repair)
+
+
+def _white_noise(gnss: GnssStream) -> float:
+    """Standard deviation per axis of what changes from fix to fix, by third differences, metres."""
+    third = np.diff(gnss.position_enu[:, :2], n=3, axis=0)
+    return 1.4826 * float(np.median(np.abs(third))) / np.sqrt(20.0) if len(third) else 0.0
+
+
+def _reduced(
+    gnss: GnssStream, kept: NDArray[np.bool_], words: str, remedy: str, repair: bool
+) -> tuple[GnssStream, list[SensorCheck]]:
+    ending = "; they were left out." if repair else "."
+    lost = float(np.mean(~kept))
+    check = SensorCheck(
+        f"gnss {gnss.name}", False, lost, 0.0, words + ending, remedy, "fraction of the fixes"
+    )
+    if not repair:
+        return gnss, [check]
+    return take_fixes(gnss, kept), [check.with_action("repaired")]
+
+
+def take_fixes(gnss: GnssStream, kept: NDArray[np.bool_]) -> GnssStream:
+    """The chosen fixes."""
+    velocity = None if gnss.velocity_enu is None else gnss.velocity_enu[kept]
+    return replace(
+        gnss,
+        timestamps_ns=gnss.timestamps_ns[kept],
+        position_enu=gnss.position_enu[kept],
+        covariances=gnss.covariances[kept],
+        velocity_enu=velocity,
+    )
+
+
+def _without_jumps(
+    gnss: GnssStream, path: Trajectory, time_offset_s: float, repair: bool
+) -> tuple[GnssStream, list[SensorCheck]]:
+    """The longest stretch between jumps that the path does not share."""
+    steps = np.diff(gnss.position_enu[:, :2], axis=0)
+    seconds = np.diff(gnss.timestamps_ns)[:, None] * 1e-9
+    if len(steps) < _FEWEST:
+        return gnss, []
+    velocity = steps / np.maximum(seconds, 1e-3)
+    # a vessel's velocity changes by little from fix to fix; noise is in the median
+    nearby = np.array([np.median(velocity[max(k - 4, 0) : k + 5], axis=0) for k in range(len(steps))])
+    excess = np.linalg.norm(steps - nearby * seconds, axis=1)
+    noise = 1.4826 * float(np.median(np.abs(excess - np.median(excess))))
+    limit = max(_LEAST_JUMP_M, _JUMP_STDS * noise)
+    jumps = np.flatnonzero(excess > limit)
+    if not len(jumps):
+        return gnss, []
+    stretch = np.zeros(len(gnss.timestamps_ns), dtype=np.int64)
+    stretch[jumps + 1] = 1
+    stretch = np.cumsum(stretch)
+    kept = _levels_alike(gnss, path, time_offset_s, stretch, max(limit, 3 * noise))
+    if kept.all():
+        return gnss, []
+    first = int(jumps[0])
+    at = (gnss.timestamps_ns[first + 1] - gnss.timestamps_ns[0]) * 1e-9
+    words = (
+        f"it jumps by {excess[first]:.1f} m at {at:.1f} s ({len(jumps)} jumps) where the cameras' path does not; "
+        f"{int((~kept).sum())} fixes do not belong to its longest stretch"
+    )
+    return _reduced(gnss, kept, words, "Check the reception, or the receiver's change of mode.", repair)
+
+
+def _levels_alike(
+    gnss: GnssStream, path: Trajectory, time_offset_s: float, stretch: NDArray[np.int64], limit: float
+) -> NDArray[np.bool_]:
+    """(G,) fixes of the longest stretch, and those of others that lie as far from the path as it does."""
+    counts = np.bincount(stretch)
+    longest = stretch == int(np.argmax(counts))
+    try:
+        fit = fit_receiver(
+            path, take_fixes(gnss, longest), gnss.position_enu[longest], time_offset_s=time_offset_s
+        )
+        whole = fit_receiver(path, gnss, gnss.position_enu, time_offset_s=time_offset_s, with_lag=False)
+    except UnobservableError:
+        return longest
+    if whole.rms < 1.5 * fit.rms + 0.02 * limit and np.abs(whole.residuals[:, :2]).max() < limit:
+        return np.ones(len(stretch), dtype=bool)
+    off: Array = np.full(len(stretch), np.inf)
+    # the whole fit is bent by the jumps: stretches are judged against the one around the longest
+    medians = {
+        s: np.median(whole.residuals[np.isin(whole.rows, np.flatnonzero(stretch == s)), :2], axis=0)
+        for s in range(len(counts))
+        if np.isin(whole.rows, np.flatnonzero(stretch == s)).sum() >= 3
+    }
+    base = medians.get(int(np.argmax(counts)))
+    for s, level in medians.items():
+        if base is not None:
+            off[stretch == s] = float(np.linalg.norm(level - base))
+    return np.asarray(longest | (off < 0.5 * limit))
+
+
+def _without_outliers(
+    gnss: GnssStream, fit: ReceiverFit, repair: bool
+) -> tuple[GnssStream, list[SensorCheck]]:
+    """Without single fixes far from the path."""
+    far = np.linalg.norm(fit.residuals[:, :2], axis=1)
+    limit = max(_OUTLIER_STDS * fit.rms, _LEAST_JUMP_M)
+    bad = far > limit
+    if not bad.any():
+        return gnss, []
+    kept = np.ones(len(gnss.timestamps_ns), dtype=bool)
+    kept[fit.rows[bad]] = False
+    words = f"{int(bad.sum())} fixes lie up to {far.max():.1f} m off the path"
+    return _reduced(gnss, kept, words, "Check the reception.", repair)

@@ -1,0 +1,221 @@
+"""Gyroscope, clocks and mounts, judged by how every camera's turns fit the gyroscope's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import numpy as np
+
+from rigwake._types import Array
+from rigwake.geometry import so3
+from rigwake.plausibility.turn_fit import TurnFit, rotation_between
+from rigwake.plausibility.values import SensorCheck
+
+_EXPLAINED = 0.15
+_SCALE = 0.01
+_SIGMAS = 6.0
+_DRIFT = 2.5e-4
+_TURNED = np.deg2rad(0.2)
+_FEWEST = 8  # strides on either side of a change
+
+
+def check_scale(
+    fits: Mapping[str, TurnFit], sound_lenses: frozenset[str]
+) -> tuple[tuple[SensorCheck, ...], float | None]:
+    """The gyroscope's scale by cameras whose lens is known to be right, and the factor that corrects it.
+
+    Cameras that stand alone with a wrong scale are checks of their own. The factor is None where none is needed, or
+    where fewer than two cameras agree on one.
+    """
+    quantity = "a camera's turns over the gyroscope's"
+    known = {n: f for n, f in fits.items() if f.unexplained <= _EXPLAINED and n in sound_lenses}
+    if not known:
+        return (), None
+    middle = float(np.median([f.scale for f in known.values()]))
+    off = {n: f for n, f in known.items() if abs(f.scale - 1) > max(_SCALE, _SIGMAS * f.std[7])}
+    if len(off) * 2 <= len(known):
+        checks = [SensorCheck("gyroscope", True, middle, 1.0, quantity=quantity)]
+        checks += [_camera_scale(name, fit) for name, fit in off.items()]
+        return tuple(checks), None
+    spread = max(abs(f.scale / middle - 1) for f in off.values())
+    words = (
+        f"its scale is wrong: {', '.join(f'{n} turned by {f.scale:.4f} of it' for n, f in sorted(off.items()))}, "
+        "although the lenses fit their own tracks"
+    )
+    remedy = "Calibrate the gyroscope's scale, or check its unit and the rate that its stamps claim."
+    check = SensorCheck("gyroscope", False, middle, 1.0, f"{words}.", remedy, quantity)
+    agreed = len(off) >= 2 and spread < 0.004 and abs(middle - 1) < 0.1
+    return (check,), middle if agreed else None
+
+
+def _camera_scale(name: str, fit: TurnFit) -> SensorCheck:
+    words = f"it turns by {fit.scale:.4f} of what the gyroscope and the other cameras say: its lens is wrong."
+    remedy = "Calibrate its lens (`rigwake intrinsics`)."
+    return SensorCheck(f"camera {name}", False, fit.scale, 1.0, words, remedy, "turns over the gyroscope's")
+
+
+def check_clocks(fits: Mapping[str, TurnFit]) -> tuple[SensorCheck, ...]:
+    """Clocks that drift: one camera's against the IMU, or the IMU's against all cameras."""
+    quantity = "seconds lost against the IMU's clock per second"
+    known = {n: f for n, f in fits.items() if f.unexplained <= _EXPLAINED}
+    off = {n: f for n, f in known.items() if abs(f.drift) > max(_DRIFT, _SIGMAS * f.std[8])}
+    common = float(np.median([f.drift for f in known.values()])) if known else 0.0
+    alike = [n for n, f in off.items() if abs(f.drift - common) < max(0.3 * abs(common), 3 * f.std[8])]
+    if len(known) >= 2 and len(alike) * 2 > len(known):
+        words = (
+            f"its clock runs {1e6 * common:+.0f} ppm against every camera's: its stamps claim a wrong rate."
+        )
+        remedy = "Stamp samples when they are taken; check the rate that the driver assumes."
+        return (SensorCheck("imu", False, common, _DRIFT, words, remedy, quantity),)
+    checks = []
+    for name, fit in off.items():
+        words = (
+            f"its clock drifts against the IMU's by {1e6 * fit.drift:+.0f} ± {1e6 * fit.std[8]:.0f} ppm, "
+            f"{1e3 * abs(fit.drift) * (fit.end_ns[-1] - fit.start_ns[0]) * 1e-9:.0f} ms over the recording."
+        )
+        remedy = "Synchronise its clock (PTP, hardware trigger) or stamp its images on one computer."
+        checks.append(SensorCheck(f"camera {name}", False, fit.drift, _DRIFT, words, remedy, quantity))
+    return tuple(checks)
+
+
+@dataclass(frozen=True, eq=False)
+class MountChange:
+    """A camera that sat otherwise before than after: when (its own clock), and both `imu_from_cam` (3, 3).
+
+    std: of the angle between both. felt: the turn that the camera saw then and the gyroscope did not, radians, or None
+    where no single stride shows it.
+    """
+
+    at_ns: int
+    before: Array
+    after: Array
+    std: float
+    coupling: float | None = None
+
+    @property
+    def turned(self) -> float:
+        """Angle between both, radians."""
+        return float(np.linalg.norm(so3.log(self.before.T @ self.after)))
+
+
+def mount_change(fit: TurnFit) -> MountChange | None:
+    """The time that best splits a camera's turns into two mountings; None where one mounting explains them as well.
+
+    A camera that was knocked, exchanged or whose picture was turned keeps its own turns, but no longer under one
+    rotation towards the IMU. A knock is also a turn of the camera that the gyroscope did not feel: where one stride
+    shows it, the same turn between both sides confirms it.
+    """
+    turns, gyro, n = fit.camera_turns, _gyro_turns(fit), len(fit.camera_turns)
+    if n < 2 * _FEWEST:
+        return None
+    sizes = np.linalg.norm(fit.residuals, axis=1)
+    knocks = []
+    for k in np.flatnonzero(sizes > max(_TURNED, 10 * fit.rms)).tolist():
+        if _FEWEST <= k < n - _FEWEST and _stays(fit, gyro, k):
+            knocks.append(replace(_split(fit, gyro, k, 1), coupling=float(sizes[k])))
+    if knocks:
+        return max(knocks, key=lambda found: found.coupling or 0.0)
+    costs = [
+        _misfit(turns[:k], gyro[:k], fit.rms) + _misfit(turns[k:], gyro[k:], fit.rms)
+        for k in range(_FEWEST, n - _FEWEST + 1)
+    ]
+    best = _split(fit, gyro, _FEWEST + int(np.argmin(costs)), 0)
+    return best if best.turned > max(_TURNED, _SIGMAS * best.std) else None
+
+
+def _stays(fit: TurnFit, gyro: Array, k: int) -> bool:
+    """Whether the turn that stride k shows beyond the gyroscope's is there to stay: undone, all later turns fit better.
+
+    A bad pose makes two such strides, which cancel; what stays may hide in the gyroscope's bias, so the bias is free.
+    """
+    before, after = fit.residuals[k - 1], fit.residuals[k + 1]
+    if min(np.linalg.norm(fit.residuals[k] + x) for x in (before, after)) < 0.5 * np.linalg.norm(
+        fit.residuals[k]
+    ):
+        return False
+    knock = so3.exp(fit.imu_from_cam.T @ fit.residuals[k])
+    others = np.arange(len(gyro)) != k
+    undone = fit.camera_turns.copy()
+    undone[k + 1 :] = undone[k + 1 :] @ knock.T
+    given = _misfit(fit.camera_turns[others], gyro[others], fit.rms, biased=True)
+    return _misfit(undone[others], gyro[others], fit.rms, biased=True) < given
+
+
+def _split(fit: TurnFit, gyro: Array, k: int, skipped: int) -> MountChange:
+    """Both mountings for a change at stride k; so many strides from there on belong to neither."""
+    sides = (slice(0, k), slice(k + skipped, None))
+    mounts = [rotation_between(fit.camera_turns[part], gyro[part]) for part in sides]
+    stds = [
+        _rotation_std(fit.camera_turns[part], gyro[part], X) for part, X in zip(sides, mounts, strict=True)
+    ]
+    return MountChange(int(fit.start_ns[k]), mounts[0], mounts[1], float(np.hypot(stds[0], stds[1])))
+
+
+def _gyro_turns(fit: TurnFit) -> Array:
+    """(N, 3) rotation vectors of the gyroscope over the strides, from the camera's and the residuals."""
+    turned = fit.imu_from_cam @ so3.exp(fit.camera_turns) @ fit.imu_from_cam.T
+    return so3.log(turned @ so3.exp(-fit.residuals))
+
+
+def _misfit(turns: Array, gyro: Array, noise: float, *, biased: bool = False) -> float:
+    """Robust cost of the best rotation; biased: of the best rotation and bias."""
+    if biased:
+        turns, gyro = turns - turns.mean(axis=0), gyro - gyro.mean(axis=0)
+    X = rotation_between(turns, gyro)
+    off = np.linalg.norm(turns @ X.T - gyro, axis=1)
+    return float(np.sum(np.log1p((off / max(3 * noise, 1e-4)) ** 2)))
+
+
+def _rotation_std(turns: Array, gyro: Array, X: Array) -> float:
+    off = turns @ X.T - gyro
+    noise = 1.4826 * float(np.median(np.abs(off)))
+    moment = np.einsum("ni,nj->ij", gyro, gyro)
+    information = np.trace(moment) * np.eye(3) - moment  # of a rotation that is told by how it turns vectors
+    return float(noise / np.sqrt(max(float(np.linalg.eigvalsh(information)[0]), 1e-12)))
+
+
+def check_mounts(fits: Mapping[str, TurnFit]) -> tuple[SensorCheck, ...]:
+    """Cameras that were knocked, exchanged or turned during the recording, with the time."""
+    quantity = "turn of the mount during the recording, deg"
+    changes = {}
+    for name, fit in fits.items():
+        change = mount_change(fit)
+        if change is not None:
+            changes[name] = change
+    partners = _exchanged(changes)
+    checks = []
+    for name, change in changes.items():
+        at = (change.at_ns - int(fits[name].start_ns[0])) * 1e-9
+        size = np.rad2deg(change.turned)
+        if name in partners:
+            words = f"it and {partners[name]} are exchanged from {at:.1f} s on."
+            remedy = "Calibrate the part before or after (--start, --duration)."
+        elif size > 20:
+            words = (
+                f"it looks {size:.0f} deg elsewhere from {at:.1f} s on: pictures of another camera, turned pictures, "
+                "or a mount that moved."
+            )
+            remedy = "Calibrate the part before or after (--start, --duration)."
+        else:
+            size = size if change.coupling is None else np.rad2deg(change.coupling)
+            words = f"it was knocked at {at:.1f} s: its mount turned by {size:.2f} deg."
+            remedy = "Fix its mount; calibrate the part before or after (--start, --duration)."
+        checks.append(
+            SensorCheck(
+                f"camera {name}", False, float(size), float(np.rad2deg(_TURNED)), words, remedy, quantity
+            )
+        )
+    return tuple(checks)
+
+
+def _exchanged(changes: Mapping[str, MountChange]) -> dict[str, str]:
+    """Cameras that sit after a change where another sat before it, and the other way round."""
+    found = {}
+    for a, b in permutations(changes, 2):
+        there = np.linalg.norm(so3.log(changes[a].after.T @ changes[b].before))
+        back = np.linalg.norm(so3.log(changes[b].after.T @ changes[a].before))
+        if max(there, back) < np.deg2rad(10) and changes[a].turned > np.deg2rad(15):
+            found[a] = b
+    return found
