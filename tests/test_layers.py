@@ -40,6 +40,7 @@ LAYERS = [
     ["report"],
     ["config"],
     ["pipeline"],
+    ["views"],
     ["cli", "__main__"],
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

@@ -1,4 +1,4 @@
-"""`rigwake demo`: simulate, calibrate, evaluate and report, out of the box."""
+"""`rigwake demo`: simulate, calibrate, evaluate, draw the surround view and report, out of the box."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def command(
         Path, typer.Option("-o", "--out", "--output", help="Folder for the recording and the result.")
     ] = Path("demo"),
 ) -> None:
-    """Simulate a harbour recording, calibrate it, compare with the truth and write the report.
+    """Simulate a harbour recording, calibrate it, compare with the truth, draw its seamless view, write the report.
 
     The recording is kept: a second run calibrates it again.
 
     Example: [cyan]rigwake demo -o demo[/cyan]
     """
-    from rigwake.cli import calibrate, evaluate, report, simulate
+    from rigwake.cli import calibrate, evaluate, report, simulate, surround
 
     require_writable("-o", folder, folder=True)
 
@@ -34,6 +34,7 @@ def command(
         simulate.command("demo", output=recording)
     calibrate.command(recording, result, force=True)
     evaluate.command(result / "calibration.yaml", folder / "harbour_truth" / "truth.yaml")
+    surround.command(result / "calibration.yaml", recording, output=result / "surround", radius_m=20.0)
     report.command(result)
     next_step(
         ["rigwake", "report", result, "--open"], "then calibrate your own: rigwake calibrate REC -o OUT"

@@ -33,6 +33,7 @@ VERBS: tuple[str, ...] = (
     "export",
     "report",
     "convert",
+    "surround",
     "simulate",
     "demo",
 )

@@ -23,6 +23,7 @@ from rigwake.report.motion_figures import MotionFigures, motion_of, paths_in_one
 from rigwake.report.picture_overlays import embed_pictures, mask_uri
 from rigwake.report.report_verdict import judge
 from rigwake.report.scene import path_scene, rig_scene
+from rigwake.report.seamless import load_seamless
 
 
 def build_report(source: ReportContent | Path | str) -> Path:
@@ -86,6 +87,7 @@ def _values(content: ReportContent) -> dict[str, Any]:
         "motion": motion,
         "pictures": embedded,
         "unreadable": unreadable,
+        "seamless": load_seamless(content.folder),
         "checks": plain(calibration.checks),
         "provenance": plain(calibration.provenance),
         "steps": _first_guess(content),

@@ -28,7 +28,7 @@ _LAPLACIAN = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
 _SLOPE_POWER = 2 * 12 / 64  # of Sobel's slopes / 8, along both axes, per variance of independent noise
 
 
-class Rays(Protocol):
+class ScaledRays(Protocol):
     """What tracking needs of a lens: which pixel sees which ray (see `cameras.base.CameraModel`)."""
 
     def project(self, points_cam: Array) -> tuple[Array, Mask]:

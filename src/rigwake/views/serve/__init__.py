@@ -1,0 +1,1 @@
+"""The live page: a server for newest frames, and the page that shows them."""
