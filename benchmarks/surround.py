@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
 from rigwake.views.colour import ColourModel
 from rigwake.views.frames import FrameSet
-from rigwake.views.projections import Equirectangular, TopDown
+from rigwake.views.projections import EquirectangularView, TopDown
 from rigwake.views.strips import level_strip
 from rigwake.views.surface import WaterAndShell
 from rigwake.views.surround_view import SurroundView
@@ -54,7 +54,7 @@ def main() -> None:
     stack = np.stack([cv2.GaussianBlur(image, (0, 0), 3) for image in noise])
     frames = FrameSet(0, rig.names, stack, {}, np.zeros(4))
     jpegs = [cv2.imencode(".jpg", image)[1] for image in stack]
-    projection = Equirectangular()
+    projection = EquirectangularView()
     remaps = _remaps(rig, stand, surface, projection)
 
     def peer() -> None:

@@ -40,6 +40,8 @@ LAYERS = [
     ["report"],
     ["config"],
     ["pipeline"],
+    ["logbook"],  # the history of a vessel
+    ["monitor"],
     ["views"],
     ["cli", "__main__"],
 ]

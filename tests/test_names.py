@@ -23,7 +23,7 @@ OLD_WORDS = {
     r"promise[ds]?": "assumed, predicted",
     r"doubt(s|ful)?": "uncertainty",
     r"feign(s|ed)?": "spurious",
-    r"foreign": "external",
+    r"foreign(?!_keys)": "external",
     r"kept[- _]back": "held-out",
     r"rig adjustment": "rig bundle adjustment",
     r"(not |un)determined(?! entry)": "unobservable",

@@ -17,11 +17,18 @@ from rigwake.errors import InputError, UsageError
 from rigwake.tracking.masks import pixel_grid
 from rigwake.views.blend import blended_still
 from rigwake.views.compose import compose
-from rigwake.views.draw import WaterDoubt, near_sectors, ring_distances, water_doubt
+from rigwake.views.draw import WaterUncertainty, near_sectors, ring_distances, water_uncertainty
 from rigwake.views.frames import FrameSet, place
 from rigwake.views.lookup import STEP, coarse_maps, interpolated_pixels
 from rigwake.views.present import Decoration, Presenter
-from rigwake.views.projections import Bowl, Cylinder, Equirectangular, TopDown, ViewProjection, VirtualCamera
+from rigwake.views.projections import (
+    Bowl,
+    CylinderView,
+    EquirectangularView,
+    TopDown,
+    ViewProjection,
+    VirtualCamera,
+)
 from rigwake.views.sphere_metadata import mark_picture, spherical_v1_box
 from rigwake.views.surface import WaterAndShell, WaterAndStixels
 from rigwake.views.surround_rig import SurroundRig
@@ -31,8 +38,8 @@ from rigwake.views.weights import blending_weights, camera_quality
 from view_scenes import HEIGHT_M, attitude, four_cameras, photograph, water_and_ring
 
 VIEWS: list[ViewProjection] = [
-    Equirectangular(256, 128),
-    Cylinder(256, 96),
+    EquirectangularView(256, 128),
+    CylinderView(256, 96),
     TopDown(128, 128, 9.0),
     Bowl(160, 96),
     VirtualCamera(160, 96, 40.0),
@@ -95,7 +102,7 @@ def test_fused_pass_equals_plain_arithmetic(scene, projection: ViewProjection) -
 
 
 @pytest.mark.parametrize(
-    "projection", [Equirectangular(), TopDown(), Cylinder()], ids=lambda p: type(p).__name__
+    "projection", [EquirectangularView(), TopDown(), CylinderView()], ids=lambda p: type(p).__name__
 )
 def test_coarse_lookup_is_exact_to_a_twentieth_of_a_pixel(projection: ViewProjection) -> None:
     """Away from folds of the surface, where the water ends at the shell."""
@@ -125,10 +132,10 @@ def test_coarse_lookup_is_exact_to_a_twentieth_of_a_pixel(projection: ViewProjec
 
 def test_panorama_shows_the_world_from_the_viewpoint(scene) -> None:
     rig, frames = scene
-    view = SurroundView(rig, Equirectangular(512, 256))
+    view = SurroundView(rig, EquirectangularView(512, 256))
     picture = view.picture(frames, STAND, RING)
     pixels = pixel_grid(512, 256).astype(float)
-    directions = Equirectangular(512, 256).directions(pixels)
+    directions = EquirectangularView(512, 256).directions(pixels)
     expected = water_and_ring(12.0)(np.zeros_like(directions), directions).reshape(256, 512, 3)
     rows = slice(95, 160)
     assert np.median(np.abs(picture.astype(float) - expected)[rows]) < 3
@@ -140,7 +147,7 @@ def test_panorama_shows_the_world_from_the_viewpoint(scene) -> None:
 def test_gains_brighten_and_saturate(scene) -> None:
     rig, frames = scene
     quality = camera_quality(rig)
-    lookup = coarse_maps(rig, STAND, Cylinder(256, 96), WaterAndShell(), quality)
+    lookup = coarse_maps(rig, STAND, CylinderView(256, 96), WaterAndShell(), quality)
     plain = compose(frames.stack, lookup, quality.usable).astype(float)
     gains = np.tile(np.float32([1.5, 1.0, 0.5]), (4, 1))
     shading = np.full(lookup.weights.shape, 1.2, np.float32)
@@ -165,7 +172,7 @@ def test_weights_sum_to_one_or_zero(cameras: int, feather_deg: float) -> None:
 def test_missing_camera_is_named_and_replaced(scene) -> None:
     rig, frames = scene
     lost = frame_set(rig, frames.images(rig), {"front": "black"})
-    presenter = Presenter(SurroundView(rig, Cylinder(512, 160)), Decoration())
+    presenter = Presenter(SurroundView(rig, CylinderView(512, 160)), Decoration())
     whole = presenter.picture(frames, STAND, RING)
     picture = presenter.picture(lost, STAND, RING)
     sectors = presenter.view.missing_sectors(lost, STAND, RING)
@@ -184,7 +191,7 @@ def test_rig_of_one_camera(scene) -> None:
     one = SurroundRig(
         rig.names[:1], rig.models[:1], rig.rig_from_cam[:1], (0.0,), rig.viewpoint_rig, rig.forward_rig
     )
-    view = SurroundView(one, Equirectangular(256, 128))
+    view = SurroundView(one, EquirectangularView(256, 128))
     single = FrameSet(0, one.names, frames.stack[:1], {}, np.zeros(1))
     picture = view.picture(single, STAND, WaterAndShell())
     assert picture[64, 128].any()
@@ -198,7 +205,7 @@ def test_rig_of_one_camera(scene) -> None:
 
 def test_careful_still_is_as_good_and_closes_astern(scene) -> None:
     rig, frames = scene
-    view = SurroundView(rig, Equirectangular(512, 256))
+    view = SurroundView(rig, EquirectangularView(512, 256))
     careful = blended_still(view, frames, STAND, RING, wraps=True)
     live = view.picture(frames, STAND, RING)
     both = (careful.max(axis=2) > 0) & (live.max(axis=2) > 0)
@@ -212,14 +219,14 @@ def test_careful_still_is_as_good_and_closes_astern(scene) -> None:
 def test_rings_bumper_and_doubt() -> None:
     assert ring_distances(25.0) == [5, 10, 15, 20, 25]
     assert all(len(ring_distances(r)) <= 6 for r in np.geomspace(1, 900, 60))
-    required_ratio = WaterDoubt(height_std_m=0.04, tilt_std=0.01)
+    uncertainty = WaterUncertainty(height_std_m=0.04, tilt_std=0.01)
     rng = np.random.default_rng(0)
     height = 2.0 + rng.normal(0, 0.04, 20_000)
     depression = np.arctan2(2.0, 20.0) + rng.normal(0, 0.001, 20_000)
-    small = WaterDoubt(height_std_m=0.04, tilt_std=0.001)
+    small = WaterUncertainty(height_std_m=0.04, tilt_std=0.001)
     assert np.std(height / np.tan(depression)) == pytest.approx(small.distance_std_m(20.0, 2.0), rel=0.05)
-    assert required_ratio.distance_std_m(20, 2) > small.distance_std_m(20, 2)
-    calibrated = water_doubt(attitude(), boat("base_link"), 0.05)
+    assert uncertainty.distance_std_m(20, 2) > small.distance_std_m(20, 2)
+    calibrated = water_uncertainty(attitude(), boat("base_link"), 0.05)
     assert calibrated.camera_tilt_std > 0
     assert calibrated.camera_height_std_m == pytest.approx(0.011, rel=0.6)
     distance = np.full((360, 1), np.nan)

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rigwake.views.gain import blame_cameras
 
 from rigwake.geometry.se3 import SE3
 from rigwake.readers.open import open_recording
@@ -16,6 +15,7 @@ from rigwake.views.floor_seams import floor_seams
 from rigwake.views.frames import frame_sets, output_times, require_fit
 from rigwake.views.projections import TopDown
 from rigwake.views.rig_sources import FloorPlan, read_rig_source, rig_from_homographies
+from rigwake.views.seam_blame import blame_cameras
 from rigwake.views.seam_report import seams_of
 from rigwake.views.seams import SeamMeter
 from rigwake.views.stills import picture_per_camera
@@ -94,5 +94,5 @@ def test_harbour_seams_and_a_knocked_camera(real_recordings: Path) -> None:
     places = list(rig.rig_from_cam)
     places[2] = places[2] * SE3.exp(np.array([np.deg2rad(1.0), 0, 0, 0, 0, 0]))
     knocked = replace(rig, rig_from_cam=tuple(places))
-    gains = blame_cameras(knocked, stands[0], surface, measured(knocked))
-    assert [b.name for b in gains if b.is_to_blame] == ["back"]
+    blames = blame_cameras(knocked, stands[0], surface, measured(knocked))
+    assert [b.name for b in blames if b.is_to_blame] == ["back"]

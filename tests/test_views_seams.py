@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from rigwake.views.gain import blame_cameras
 
 from rigwake._types import Image
 from rigwake.errors import EstimationError
@@ -17,6 +16,7 @@ from rigwake.views.colour import (
 from rigwake.views.frames import FrameSet, place
 from rigwake.views.height import edges_below_things, height_from_contacts
 from rigwake.views.horizon import horizon_attitude
+from rigwake.views.seam_blame import blame_cameras
 from rigwake.views.seam_report import seams_of
 from rigwake.views.seams import SeamMatches, SeamMeter, overlapping_pairs
 from rigwake.views.surface import Surface, WaterAndShell, WaterAndStixels
@@ -85,17 +85,17 @@ def test_turned_camera_is_blamed(worlds, name: str, axis: int) -> None:
     turn = tuple(1.0 if k == axis else 0.0 for k in range(3))
     rig = four_cameras({name: turn})
     surface = WaterAndShell(25.0)
-    gains = blame_cameras(rig, STAND, surface, matches(worlds[30.0], rig, surface))
-    assert [b.name for b in gains if b.is_to_blame] == [name]
-    assert {b.name: b.size_deg for b in gains}[name] == pytest.approx(1.0, abs=0.35)
+    blames = blame_cameras(rig, STAND, surface, matches(worlds[30.0], rig, surface))
+    assert [b.name for b in blames if b.is_to_blame] == [name]
+    assert {b.name: b.size_deg for b in blames}[name] == pytest.approx(1.0, abs=0.35)
 
 
 @pytest.mark.slow
 def test_nobody_is_blamed_without_a_fault(worlds) -> None:
     for surface in (ring(30.0), WaterAndShell(25.0)):
-        gains = blame_cameras(RIG, STAND, surface, matches(worlds[30.0], RIG, surface))
-        assert not any(b.is_to_blame for b in gains)
-        assert max(b.size_deg for b in gains) < 0.3
+        blames = blame_cameras(RIG, STAND, surface, matches(worlds[30.0], RIG, surface))
+        assert not any(b.is_to_blame for b in blames)
+        assert max(b.size_deg for b in blames) < 0.3
     assert blame_cameras(RIG, STAND, WaterAndShell(), []) == []
 
 

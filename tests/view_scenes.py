@@ -9,7 +9,7 @@ from rigwake._types import Array, Image
 from rigwake.geometry import so3
 from rigwake.rig import Rig, RigCamera
 from rigwake.tracking.masks import pixel_grid
-from rigwake.views.attitude import Attitude, level_rotation
+from rigwake.views.attitude import LevelAttitude, level_rotation
 from rigwake.views.surround_rig import SurroundRig, surround_rig
 
 HEIGHT_M = 1.9
@@ -31,15 +31,15 @@ def four_cameras(rotation_error_deg: dict[str, tuple[float, float, float]] | Non
     return surround_rig(Rig("base_link", cameras))
 
 
-def attitude(roll_deg: float = 0.0, pitch_deg: float = 0.0, height_m: float = HEIGHT_M) -> Attitude:
+def attitude(roll_deg: float = 0.0, pitch_deg: float = 0.0, height_m: float = HEIGHT_M) -> LevelAttitude:
     """Rolled to starboard, then pitched bow down."""
     level_from_rig = so3.exp(np.deg2rad([0.0, pitch_deg, 0.0])) @ so3.exp(np.deg2rad([roll_deg, 0.0, 0.0]))
     up_rig = level_from_rig[2]
-    return Attitude(level_rotation(up_rig, np.array([1.0, 0.0, 0.0])), height_m, source="trajectory")
+    return LevelAttitude(level_rotation(up_rig, np.array([1.0, 0.0, 0.0])), height_m, source="trajectory")
 
 
 def photograph(
-    rig: SurroundRig, stand: Attitude, colour: Callable[[Array, Array], Array], supersample: int = 1
+    rig: SurroundRig, stand: LevelAttitude, colour: Callable[[Array, Array], Array], supersample: int = 1
 ) -> dict[str, Image]:
     """What the cameras see: `colour(origins, directions)` gives (N, 3) BGR of rays in the level frame."""
     images = {}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rigwake.cli.console import next_step, out, progress_bar, write_json
-from rigwake.cli.options import JsonOption, TopicOption, TopicsOption, require
+from rigwake.cli.options import CameraFileOption, JsonOption, TopicOption, TopicsOption, require
 from rigwake.errors import UsageError
 
 if TYPE_CHECKING:
@@ -70,8 +71,9 @@ def command(
         list[str] | None,
         typer.Option("--from", metavar="CAMERA=URL", help="Live source in place of REC; may be repeated."),
     ] = None,
-    topic: TopicOption = (),
+    topic: TopicOption = None,
     topics: TopicsOption = None,
+    camera_file: CameraFileOption = None,
     json_file: JsonOption = None,
 ) -> None:
     """Draw all cameras as one seamless view, and measure its seams.
@@ -97,7 +99,7 @@ def command(
     options = SurroundOptions(stabilise, surface, shell_m, height_m, hull, trajectory)
     projection = _projection(view, size, radius_m, yaw, fov)
     outline = _two_numbers(vessel, "--vessel") if vessel else None
-    topic_map = TopicMap.from_options(topic, topics)
+    topic_map = TopicMap.from_options(topic or (), topics, camera_file or ())
     if live:
         from rigwake.views.live import serve_live
 
@@ -108,13 +110,13 @@ def command(
         return
     assert recording is not None
     with progress_bar() as bar:
-        task = bar.add_task("reading", total=5)
+        task, steps = bar.add_task("reading", total=5), count(1)
         setup = prepare_surround(
             calibration,
             recording,
             options,
             topic_map,
-            lambda words: bar.update(task, advance=1, description=words),
+            lambda words: bar.update(task, description=words, completed=next(steps)),
         )
     decoration = Decoration(bumper_m, outline, hull == "mask", setup.wave_std_m, setup.calibration)
     if str(json_file) != "-":
@@ -168,7 +170,7 @@ def _two_numbers(text: str, option: str) -> tuple[float, float]:
 
 
 def _projection(view: str, size: str | None, radius_m: float, yaw: float, fov: float) -> ViewProjection:
-    from rigwake.views.projections import Bowl, Cylinder, Equirectangular, TopDown, VirtualCamera
+    from rigwake.views.projections import Bowl, CylinderView, EquirectangularView, TopDown, VirtualCamera
 
     wanted = _two_numbers(size, "--size") if size else None
     if wanted is not None and (max(wanted) > _LARGEST_PX or min(wanted) < 16 or any(x % 1 for x in wanted)):
@@ -184,7 +186,7 @@ def _projection(view: str, size: str | None, radius_m: float, yaw: float, fov: f
         return Bowl(**pixels, azimuth_deg=180.0 + yaw, fov_deg=min(fov, 100.0))
     if view == "camera":
         return VirtualCamera(**pixels, azimuth_deg=yaw, fov_deg=fov)
-    return Cylinder(**pixels) if view == "cylinder" else Equirectangular(**pixels)
+    return CylinderView(**pixels) if view == "cylinder" else EquirectangularView(**pixels)
 
 
 def _write(
@@ -197,7 +199,7 @@ def _write(
 ) -> None:
     """The picture, the video, or a folder with every view."""
     from rigwake.views.present import Presenter, is_sphere, needs_height, write_video
-    from rigwake.views.projections import Bowl, Cylinder, Equirectangular, TopDown
+    from rigwake.views.projections import Bowl, CylinderView, EquirectangularView, TopDown
     from rigwake.views.stills import write_picture
 
     suffix = output.suffix.lower()
@@ -215,8 +217,8 @@ def _write(
     wanted: dict[Path, ViewProjection] = {output: projection}
     if suffix not in _PICTURES:
         views: tuple[ViewProjection, ...] = (
-            Equirectangular(),
-            Cylinder(),
+            EquirectangularView(),
+            CylinderView(),
             TopDown(radius_m=radius_m),
             Bowl(),
         )

@@ -35,7 +35,7 @@ _STEEPEST_AHEAD = 0.95  # sine of the elevation beyond which a direction cannot 
 
 
 @dataclass(frozen=True, eq=False)
-class Attitude:
+class LevelAttitude:
     """How the rig stands at one time.
 
     level_from_rig: (3, 3) rotation from rig axes to the level frame. tilt_std: of roll and pitch each, radians.
@@ -61,7 +61,7 @@ class AttitudeTrack:
     """Attitudes over time.
 
     timestamps_ns: (N,) strictly increasing, rig clock. level_from_rig: (N, 3, 3). heave_m: (N,) of the viewpoint about
-    its mean height. height_m, height_std_m: that mean height; NaN where unknown. source, tilt_std: as in `Attitude`.
+    its mean height. height_m, height_std_m: that mean height; NaN where unknown. source, tilt_std: see `LevelAttitude`.
     """
 
     timestamps_ns: Stamps
@@ -72,7 +72,7 @@ class AttitudeTrack:
     height_m: float = np.nan
     height_std_m: float = 0.0
 
-    def at(self, timestamp_ns: int) -> Attitude:
+    def at(self, timestamp_ns: int) -> LevelAttitude:
         """The attitude at a time, by SLERP between neighbours; the nearest one beyond the ends."""
         stamps = self.timestamps_ns
         R, heave = self.level_from_rig[0], float(self.heave_m[0])
@@ -83,7 +83,7 @@ class AttitudeTrack:
             first, second = self.level_from_rig[before], self.level_from_rig[before + 1]
             R = first @ so3.exp(fraction * so3.log(first.T @ second))
             heave = float((1 - fraction) * self.heave_m[before] + fraction * self.heave_m[before + 1])
-        return Attitude(R, self.height_m + heave, self.tilt_std, self.height_std_m, self.source)
+        return LevelAttitude(R, self.height_m + heave, self.tilt_std, self.height_std_m, self.source)
 
     def covers(self, timestamp_ns: int, slack_s: float = 0.5) -> bool:
         """Whether a time lies within the track, or at most `slack_s` outside."""
@@ -115,18 +115,18 @@ def level_rotation(up_rig: Array, forward_rig: Array) -> Array:
     return np.stack([x, np.cross(up, x), up], axis=-2)
 
 
-def unlevelled(rig: SurroundRig, height_m: float = np.nan, height_std_m: float = 0.0) -> Attitude:
+def unlevelled(rig: SurroundRig, height_m: float = np.nan, height_std_m: float = 0.0) -> LevelAttitude:
     """The attitude when nothing tells it: up is the rig's z axis, or against the rig's y if its frame is a camera's."""
     up = np.array([0.0, 0.0, 1.0])
     if abs(float(rig.forward_rig @ up)) >= _STEEPEST_AHEAD:
         up = np.array([0.0, -1.0, 0.0])
-    return Attitude(
+    return LevelAttitude(
         level_rotation(up, rig.forward_rig), height_m, np.deg2rad(5.0), height_std_m, source="none"
     )
 
 
 def track_from_trajectory(world_from_rig: Trajectory, rig: SurroundRig) -> AttitudeTrack:
-    """Attitude and heave from poses of the rig in a world with z up (`OUT/trajectories/rig.tum`)."""
+    """LevelAttitude and heave from poses of the rig in a world with z up (`OUT/trajectories/rig.tum`)."""
     R = world_from_rig.world_from_body.rotation
     height = (world_from_rig.world_from_body * rig.viewpoint_rig)[:, 2]
     heave = height - np.median(height) if world_from_rig.is_metric else np.zeros(len(height))
@@ -140,7 +140,7 @@ def track_from_trajectory(world_from_rig: Trajectory, rig: SurroundRig) -> Attit
 
 
 def track_from_sensor(stream: AttitudeStream, rig_from_body: SE3, rig: SurroundRig) -> AttitudeTrack:
-    """Attitude from a sensor that gives roll and pitch itself. rig_from_body: how its axes sit in the rig."""
+    """LevelAttitude from a sensor that gives roll and pitch itself. rig_from_body: how its axes sit in the rig."""
     up_rig = stream.world_from_body[:, 2, :] @ rig_from_body.rotation.T
     return AttitudeTrack(
         stream.timestamps_ns,
@@ -152,7 +152,7 @@ def track_from_sensor(stream: AttitudeStream, rig_from_body: SE3, rig: SurroundR
 
 
 def track_from_imu(imu: ImuStream, rig_from_imu: SE3, rig: SurroundRig) -> AttitudeTrack:
-    """Attitude from the integrated gyro and the mean specific force; good to about half a degree.
+    """LevelAttitude from the integrated gyro and the mean specific force; good to about half a degree.
 
     Raises InputError if the IMU has fewer than 20 samples.
     """

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from rigwake._types import Image
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.frames import FrameSet
 from rigwake.views.surface import Surface
 from rigwake.views.surround_view import SurroundView
@@ -19,7 +19,7 @@ _BAND_DEG = 14.0  # seams are sought within this angle of where two cameras are 
 
 
 def blended_still(
-    view: SurroundView, frames: FrameSet, attitude: Attitude, surface: Surface, wraps: bool
+    view: SurroundView, frames: FrameSet, attitude: LevelAttitude, surface: Surface, wraps: bool
 ) -> Image:
     """(H, W, 3) BGR view of one frame set. wraps: the left and right edges of the view meet.
 

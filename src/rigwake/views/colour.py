@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake._types import Array, Floats, Image
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.strips import StripGrid, camera_strips
 from rigwake.views.surface import Shell
 from rigwake.views.surround_rig import SurroundRig
@@ -79,7 +79,7 @@ class ColourSamples:
 def colour_samples(
     images: Mapping[str, Image],
     rig: SurroundRig,
-    attitude: Attitude,
+    attitude: LevelAttitude,
     masks: Mapping[str, NDArray[np.bool_]] | None = None,
 ) -> ColourSamples:
     """Samples of one frame set, from the overlaps above the horizon."""
@@ -168,7 +168,7 @@ class GainSmoother:
     _last_ns: int | None = field(default=None)
 
     def update(
-        self, images: Mapping[str, Image], rig: SurroundRig, attitude: Attitude, timestamp_ns: int
+        self, images: Mapping[str, Image], rig: SurroundRig, attitude: LevelAttitude, timestamp_ns: int
     ) -> ColourModel:
         """The colour model at this time; unchanged if the pictures have no overlap to compare."""
         samples = colour_samples(images, rig, attitude)

@@ -44,7 +44,7 @@ def compose(
         _compose_rows(
             stack,
             lookup.pixels,
-            lookup.second_order,
+            lookup.bends,
             lookup.weights,
             usable,
             factors,
@@ -79,7 +79,7 @@ def _corner_state(pixels, weights, c, i, j, height, width):  # type: ignore[no-u
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _compose_rows(stack, pixels, second_order, weights, usable, gains, shading, plain, out, first, last):  # type: ignore[no-untyped-def]
+def _compose_rows(stack, pixels, bends, weights, usable, gains, shading, plain, out, first, last):  # type: ignore[no-untyped-def]
     cameras, source_height, source_width = stack.shape[0], stack.shape[1], stack.shape[2]
     height, width = out.shape[0], out.shape[1]
     columns = weights.shape[2]
@@ -105,7 +105,7 @@ def _compose_rows(stack, pixels, second_order, weights, usable, gains, shading, 
                 continue
             if shown == 1 and state == 1:
                 _one_camera(
-                    flat, pixels, second_order, gains, shading, plain, out, alone, i, j, v0, v1, u0, u1,
+                    flat, pixels, bends, gains, shading, plain, out, alone, i, j, v0, v1, u0, u1,
                     alone * source_height * stride, stride,
                 )  # fmt: skip
                 continue
@@ -115,7 +115,7 @@ def _compose_rows(stack, pixels, second_order, weights, usable, gains, shading, 
                 s = _corner_state(pixels, weights, c, i, j, source_height, source_width)
                 if s > 0:
                     _blend_camera(
-                        flat, flat_usable, pixels, second_order, weights, gains, shading, plain, total, c, i, j, v1 - v0,
+                        flat, flat_usable, pixels, bends, weights, gains, shading, plain, total, c, i, j, v1 - v0,
                         u1 - u0, source_height, source_width, s == 2,
                     )  # fmt: skip
             for v in range(v0, v1):
@@ -128,7 +128,7 @@ def _compose_rows(stack, pixels, second_order, weights, usable, gains, shading, 
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, inline="always")
-def _fixed(pixels, second_order, c, i, j, axis):  # type: ignore[no-untyped-def]
+def _fixed(pixels, bends, c, i, j, axis):  # type: ignore[no-untyped-def]
     """Fixed-point position at the cell's corner, its steps along a row and down a column, the twist, and the
     curvatures along and down: `p(k, m) = p00 + k a + m d + k m t + (ca k (k - 8) + cd m (m - 8)) / 128`."""
     p00, p01 = pixels[c, i, j, axis], pixels[c, i, j + 1, axis]
@@ -138,19 +138,19 @@ def _fixed(pixels, second_order, c, i, j, axis):  # type: ignore[no-untyped-def]
     down = np.int32(round((p10 - p00) * 8192.0))
     twist = np.int32(round((p11 - p10 - p01 + p00) * 1024.0))
     bend_along, bend_down = np.int32(0), np.int32(0)
-    if second_order.shape[0] > 0:
-        bend_along = np.int32(round(second_order[c, i, j, axis] * 1024.0))
-        bend_down = np.int32(round(second_order[c, i, j, axis + 2] * 512.0))
+    if bends.shape[0] > 0:
+        bend_along = np.int32(round(bends[c, i, j, axis] * 1024.0))
+        bend_down = np.int32(round(bends[c, i, j, axis + 2] * 512.0))
     return start, along, down, twist, bend_along, bend_down
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 def _one_camera(  # type: ignore[no-untyped-def]
-    flat, pixels, second_order, gains, shading, plain, out, c, i, j, v0, v1, u0, u1, base, stride
+    flat, pixels, bends, gains, shading, plain, out, c, i, j, v0, v1, u0, u1, base, stride
 ):  # fmt: skip
     """A cell that one camera shows alone."""
-    x0, xa, xd, xt, xb, xc = _fixed(pixels, second_order, c, i, j, 0)
-    y0, ya, yd, yt, yb, yc = _fixed(pixels, second_order, c, i, j, 1)
+    x0, xa, xd, xt, xb, xc = _fixed(pixels, bends, c, i, j, 0)
+    y0, ya, yd, yt, yb, yc = _fixed(pixels, bends, c, i, j, 1)
     s0, sa, sd, st = np.float32(1), np.float32(0), np.float32(0), np.float32(0)
     if not plain and shading.shape[0] > 1:
         s0 = shading[c, i, j]
@@ -194,11 +194,11 @@ def _one_camera(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 def _blend_camera(  # type: ignore[no-untyped-def]
-    flat, usable, pixels, second_order, weights, gains, shading, plain, total, c, i, j, rows, columns, height, width, partly
+    flat, usable, pixels, bends, weights, gains, shading, plain, total, c, i, j, rows, columns, height, width, partly
 ):  # fmt: skip
     """Add one camera's part of a cell to the weighted sums."""
-    x0, xa, xd, xt, xb, xc = _fixed(pixels, second_order, c, i, j, 0)
-    y0, ya, yd, yt, yb, yc = _fixed(pixels, second_order, c, i, j, 1)
+    x0, xa, xd, xt, xb, xc = _fixed(pixels, bends, c, i, j, 0)
+    y0, ya, yd, yt, yb, yc = _fixed(pixels, bends, c, i, j, 1)
     w0 = weights[c, i, j]
     wa, wd = weights[c, i, j + 1] - w0, weights[c, i + 1, j] - w0
     wt = weights[c, i + 1, j + 1] - weights[c, i + 1, j] - wa

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rigwake._types import Array, Image
 from rigwake.calibration import Calibration
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.projections import TopDown
 from rigwake.views.surface import Surface, WaterAndStixels
 from rigwake.views.surround_rig import SurroundRig
@@ -24,7 +24,7 @@ _HATCH_PX = 14
 
 
 @dataclass(frozen=True)
-class WaterDoubt:
+class WaterUncertainty:
     """What a distance on the water depends on, as standard deviations: height of the cameras (m), tilt (radians) of
     the whole rig and of a camera in it, height of a camera in the rig (m), waves (m, surface against its mean)."""
 
@@ -42,7 +42,9 @@ class WaterDoubt:
         return float(np.hypot(distance_m / height_m * vertical, (distance_m**2 / height_m + height_m) * tilt))
 
 
-def water_doubt(attitude: Attitude, calibration: Calibration | None, wave_std_m: float) -> WaterDoubt:
+def water_uncertainty(
+    attitude: LevelAttitude, calibration: Calibration | None, wave_std_m: float
+) -> WaterUncertainty:
     """The uncertainty of distances on the water: the worst camera's from the calibration, where there is one."""
     tilt, height = 0.0, 0.0
     if calibration is not None:
@@ -50,7 +52,7 @@ def water_doubt(attitude: Attitude, calibration: Calibration | None, wave_std_m:
             std = np.concatenate([np.deg2rad(camera.std_rotation_deg), camera.std_translation_m])
             tilt = max(tilt, float(np.nan_to_num(np.hypot(std[0], std[1]) / np.sqrt(2))))
             height = max(height, float(np.nan_to_num(std[5])))
-    return WaterDoubt(attitude.height_std_m, attitude.tilt_std, tilt, height, wave_std_m)
+    return WaterUncertainty(attitude.height_std_m, attitude.tilt_std, tilt, height, wave_std_m)
 
 
 def ring_distances(radius_m: float) -> list[float]:
@@ -61,7 +63,9 @@ def ring_distances(radius_m: float) -> list[float]:
     return [radius_m]
 
 
-def vessel_outline(rig: SurroundRig, attitude: Attitude, size_m: tuple[float, float] | None = None) -> Array:
+def vessel_outline(
+    rig: SurroundRig, attitude: LevelAttitude, size_m: tuple[float, float] | None = None
+) -> Array:
     """(N, 2) metres ahead and to port: the hull given by length and width, centred on the viewpoint, or else a hull
     around the cameras."""
     if size_m is not None:
@@ -83,8 +87,8 @@ def draw_top_view(
     picture: Image,
     view: TopDown,
     rig: SurroundRig,
-    attitude: Attitude,
-    required_ratio: WaterDoubt,
+    attitude: LevelAttitude,
+    uncertainty: WaterUncertainty,
     surface: Surface | None = None,
     bumper_m: float = 5.0,
     size_m: tuple[float, float] | None = None,
@@ -97,7 +101,7 @@ def draw_top_view(
     """
     centre = view.pixels(np.zeros((1, 2)))[0]
     for distance in ring_distances(view.radius_m):
-        std = required_ratio.distance_std_m(distance, attitude.height_m)
+        std = uncertainty.distance_std_m(distance, attitude.height_m)
         _ring(picture, centre, distance * view.px_per_m, _WHITE, 1)
         at = (centre + np.array([4.0, 16 - distance * view.px_per_m])).astype(int)
         _text(picture, f"{distance:g} m +-{std:.1f}" if std >= 0.05 else f"{distance:g} m", at)

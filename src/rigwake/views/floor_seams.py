@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.frames import FrameSet
 from rigwake.views.projections import TopDown
 from rigwake.views.seams import drawn_alone, followed_corners
@@ -30,7 +30,7 @@ class FloorSeam:
     median_m: float
 
 
-def floor_seams(rig: SurroundRig, frames: FrameSet, attitude: Attitude, top: TopDown) -> list[FloorSeam]:
+def floor_seams(rig: SurroundRig, frames: FrameSet, attitude: LevelAttitude, top: TopDown) -> list[FloorSeam]:
     """Draw every camera alone into a top view of the plane `attitude.height_m` below the viewpoint, and compare.
 
     Raises UsageError if the height is unknown.

@@ -19,7 +19,7 @@ import numpy as np
 
 from rigwake._types import Array, Floats, Image, Mask
 from rigwake.errors import EstimationError
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.frames import FrameSet
 from rigwake.views.levelling import Leveller
 from rigwake.views.strips import StripGrid, camera_strips
@@ -104,7 +104,9 @@ def height_from_contacts(distance_m: Array, depression: Array) -> HeightEstimate
     return HeightEstimate(height, height * spread / float(np.sqrt(independent)), int(near.sum()))
 
 
-def edges_below_things(images: dict[str, Image], rig: SurroundRig, attitude: Attitude) -> tuple[Array, Array]:
+def edges_below_things(
+    images: dict[str, Image], rig: SurroundRig, attitude: LevelAttitude
+) -> tuple[Array, Array]:
     """Horizontal distances (N,) and depressions (N,) of level edges right below patches whose distance is known.
 
     Patches of neighbouring cameras are compared in strips drawn for 28 distances (plane sweep; normalised correlation,

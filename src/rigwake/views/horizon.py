@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake._types import Array, Image
-from rigwake.views.attitude import Attitude, level_rotation
+from rigwake.views.attitude import LevelAttitude, level_rotation
 from rigwake.views.strips import StripGrid, level_strip
 from rigwake.views.surface import Shell
 from rigwake.views.surround_rig import SurroundRig
@@ -29,10 +29,10 @@ _FAR_M = 200.0
 def horizon_attitude(
     images: Mapping[str, Image],
     rig: SurroundRig,
-    start: Attitude,
+    start: LevelAttitude,
     search_deg: float = 15.0,
     masks: Mapping[str, NDArray[np.bool_]] | None = None,
-) -> Attitude | None:
+) -> LevelAttitude | None:
     """The attitude in which the longest level edge lies level; None if no tilt stands out.
 
     The level strip is made with `start`; of all tilts within `search_deg` (and a few constant elevations) the one is

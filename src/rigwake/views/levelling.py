@@ -16,8 +16,8 @@ from rigwake.readers.trajectories import read_trajectory
 from rigwake.recording import Recording, static_transform
 from rigwake.rig import Rig
 from rigwake.views.attitude import (
-    Attitude,
     AttitudeTrack,
+    LevelAttitude,
     level_rotation,
     track_from_imu,
     track_from_sensor,
@@ -42,14 +42,14 @@ class Leveller:
     rig: SurroundRig
     words: str
     track: AttitudeTrack | None = None
-    fixed: Attitude | None = None
+    fixed: LevelAttitude | None = None
     use_horizon: bool = True
     height_m: float = np.nan
     height_std_m: float = 0.0
     masks: Mapping[str, NDArray[np.bool_]] | None = None
-    _last: Attitude | None = field(init=False, default=None)
+    _last: LevelAttitude | None = field(init=False, default=None)
 
-    def at(self, timestamp_ns: int, images: Mapping[str, Image]) -> Attitude:
+    def at(self, timestamp_ns: int, images: Mapping[str, Image]) -> LevelAttitude:
         """The attitude at a time, with the height above the water."""
         if self.fixed is not None:
             return self.fixed
@@ -66,7 +66,7 @@ class Leveller:
     def with_height(self, height_m: float, height_std_m: float) -> Leveller:
         """The same at a known mean height of the viewpoint above the water."""
 
-        def at_height(attitude: Attitude | None) -> Attitude | None:
+        def at_height(attitude: LevelAttitude | None) -> LevelAttitude | None:
             return attitude and replace(attitude, height_m=height_m, height_std_m=height_std_m)
 
         track = self.track and self.track.with_height(height_m, height_std_m)

@@ -13,7 +13,7 @@ import numpy as np
 
 from rigwake._types import Image
 from rigwake.errors import InputError, UsageError
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.colour import GainSmoother, colour_samples, fit_colour
 from rigwake.views.frames import FrameSet, FrameWatch, place
 from rigwake.views.levelling import Leveller
@@ -205,7 +205,7 @@ class LiveFeed(threading.Thread):
             surface = self._surfaces.surface(images, self._rig, attitude, frames.timestamp_ns)
             self._newest.put(frames, attitude, surface, frames.timestamp_ns * 1e-9)
 
-    def _follow(self, frames: FrameSet, attitude: Attitude) -> None:
+    def _follow(self, frames: FrameSet, attitude: LevelAttitude) -> None:
         images = frames.images(self._rig)
         if len(images) < 2:
             return

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rigwake._types import Array, Floats
 from rigwake.cameras.protocol import CameraModel
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.projections import ViewProjection
 from rigwake.views.surface import Surface
 from rigwake.views.surround_rig import SurroundRig
@@ -25,7 +25,7 @@ class CoarseLookup:
     """Pixels and weights of every camera at the nodes of a grid of 8 px over the view.
 
     pixels: (C, R, K, 2) float32, outside the image where a camera does not see. quality, weights: (C, R, K) float32;
-    weights sum to one or are zero. Node (r, k) sits at pixel (8 k, 8 r) of the view. second_order: (C, R, K, 4) second
+    weights sum to one or are zero. Node (r, k) sits at pixel (8 k, 8 r) of the view. bends: (C, R, K, 4) second
     differences (`node_bends`), or (0, 0, 0, 0) if positions are linear between nodes.
     """
 
@@ -34,7 +34,7 @@ class CoarseLookup:
     pixels: Floats
     quality: Floats
     weights: Floats
-    second_order: Floats
+    bends: Floats
 
     def without(self, missing: NDArray[np.bool_], feather_deg: float = FEATHER_DEG) -> CoarseLookup:
         """The same lookup with the cameras (C,) left out that are missing."""
@@ -54,7 +54,7 @@ def view_nodes(width_px: int, height_px: int) -> tuple[Array, tuple[int, int]]:
 
 def coarse_maps(
     rig: SurroundRig,
-    attitude: Attitude,
+    attitude: LevelAttitude,
     projection: ViewProjection,
     surface: Surface,
     quality: CameraQuality,
@@ -73,8 +73,8 @@ def coarse_maps(
         pixels[index] = extended_pixels(rig.models[index], points_cam).reshape(*shape, 2)
         qualities[index] = sampled_quality(quality.quality[index], pixels[index])
     weights = blending_weights(qualities, feather_deg)
-    second_order = np.zeros((0, 0, 0, 0), np.float32) if projection.equal_angles else node_bends(pixels)
-    return CoarseLookup(projection.width_px, projection.height_px, pixels, qualities, weights, second_order)
+    bends = np.zeros((0, 0, 0, 0), np.float32) if projection.equal_angles else node_bends(pixels)
+    return CoarseLookup(projection.width_px, projection.height_px, pixels, qualities, weights, bends)
 
 
 def extended_pixels(model: CameraModel, points_cam: Array) -> Array:
@@ -114,9 +114,9 @@ def interpolated_pixels(lookup: CoarseLookup, camera: int, at: Array) -> Array:
     top = nodes[i, j] * (1 - fx) + nodes[i, j + 1] * fx
     bottom = nodes[i + 1, j] * (1 - fx) + nodes[i + 1, j + 1] * fx
     result = top * (1 - fy) + bottom * fy
-    if len(lookup.second_order):
-        second_order = lookup.second_order[camera, i, j].astype(np.float64)
-        result = result + second_order[:, :2] * fx * (fx - 1) / 2 + second_order[:, 2:] * fy * (fy - 1) / 2
+    if len(lookup.bends):
+        bends = lookup.bends[camera, i, j].astype(np.float64)
+        result = result + bends[:, :2] * fx * (fx - 1) / 2 + bends[:, 2:] * fy * (fy - 1) / 2
     return np.asarray(result)
 
 
@@ -125,11 +125,11 @@ def node_bends(pixels: Floats) -> Floats:
 
     Means over the four nodes around a cell; zero at the edges of the view and where a node lies far outside the image.
     """
-    second_order = np.zeros((*pixels.shape[:3], 4), dtype=np.float32)
+    bends = np.zeros((*pixels.shape[:3], 4), dtype=np.float32)
     for axis, part in ((2, slice(0, 2)), (1, slice(2, 4))):
         nodes = np.moveaxis(pixels, axis, 1)
         mean = (nodes[:, :-3] - nodes[:, 1:-2] - nodes[:, 2:-1] + nodes[:, 3:]) / 2
         near = (np.abs(nodes[..., 0]) < _NOT_IN_SIGHT) & (np.abs(nodes[..., 1]) < _NOT_IN_SIGHT)
         whole = near[:, :-3] & near[:, 1:-2] & near[:, 2:-1] & near[:, 3:]
-        np.moveaxis(second_order, axis, 1)[:, 1:-2, :, part] = np.where(whole[..., None], mean, 0.0)
-    return second_order
+        np.moveaxis(bends, axis, 1)[:, 1:-2, :, part] = np.where(whole[..., None], mean, 0.0)
+    return bends

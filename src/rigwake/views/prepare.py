@@ -19,7 +19,7 @@ from rigwake.readers.topics import TopicMap
 from rigwake.recording import CameraStream, Recording
 from rigwake.tracking.masks import beyond_image_circle
 from rigwake.tracking.self_mask import find_self_mask
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.colour import ColourModel, ColourSamples, colour_samples, fit_colour
 from rigwake.views.frames import FrameSet, frame_sets, output_times, require_fit
 from rigwake.views.height import HeightEstimate, estimate_height
@@ -92,11 +92,11 @@ class SurroundSetup:
         require_pictures(frames)
         return frames
 
-    def surface_at(self, frames: FrameSet, attitude: Attitude) -> Surface:
+    def surface_at(self, frames: FrameSet, attitude: LevelAttitude) -> Surface:
         """The surface at the time of a frame set."""
         return self.surfaces.surface(frames.images(self.rig), self.rig, attitude, frames.timestamp_ns)
 
-    def attitude_at(self, frames: FrameSet) -> Attitude:
+    def attitude_at(self, frames: FrameSet) -> LevelAttitude:
         """The attitude at the time of a frame set."""
         return self.leveller.at(frames.timestamp_ns, frames.images(self.rig))
 

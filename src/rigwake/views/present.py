@@ -11,13 +11,13 @@ import numpy as np
 from rigwake._types import Image
 from rigwake.calibration import Calibration
 from rigwake.errors import InputError
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.blend import blended_still
 from rigwake.views.colour import GainSmoother
-from rigwake.views.draw import caption, draw_top_view, hatch_missing, water_doubt
+from rigwake.views.draw import caption, draw_top_view, hatch_missing, water_uncertainty
 from rigwake.views.frames import FrameSet, frame_sets
 from rigwake.views.prepare import SurroundSetup, require_pictures
-from rigwake.views.projections import Bowl, Cylinder, Equirectangular, TopDown, ViewProjection
+from rigwake.views.projections import Bowl, CylinderView, EquirectangularView, TopDown, ViewProjection
 from rigwake.views.surface import Surface
 from rigwake.views.surround_view import SurroundView
 from rigwake.views.video import video_file
@@ -48,17 +48,19 @@ class Presenter:
         view = SurroundView(setup.rig, projection, setup.masks, setup.colour)
         return cls(view, decoration, GainSmoother(setup.colour) if setup.colour is not None else None)
 
-    def follow_gains(self, frames: FrameSet, attitude: Attitude) -> None:
+    def follow_gains(self, frames: FrameSet, attitude: LevelAttitude) -> None:
         """Let the gains follow the exposure, smoothed over time."""
         if self.smoother is not None and (~frames.is_missing).sum() > 1:
             self.view.colour = self.smoother.update(
                 frames.images(self.view.rig), self.view.rig, attitude, frames.timestamp_ns
             )
 
-    def picture(self, frames: FrameSet, attitude: Attitude, surface: Surface, careful: bool = False) -> Image:
+    def picture(
+        self, frames: FrameSet, attitude: LevelAttitude, surface: Surface, careful: bool = False
+    ) -> Image:
         """(H, W, 3) BGR. careful: graph-cut seams and multi-band blending, for stills."""
         projection = self.view.projection
-        wraps = isinstance(projection, Equirectangular | Cylinder)
+        wraps = isinstance(projection, EquirectangularView | CylinderView)
         if careful:
             picture = blended_still(self.view, frames, attitude, surface, wraps)
         else:
@@ -68,13 +70,13 @@ class Presenter:
             hatch_missing(picture, sectors, frames.names, frames.missing)
         if isinstance(projection, TopDown):
             d = self.decoration
-            required_ratio = water_doubt(attitude, d.calibration, d.wave_std_m)
+            uncertainty = water_uncertainty(attitude, d.calibration, d.wave_std_m)
             draw_top_view(
                 picture,
                 projection,
                 self.view.rig,
                 attitude,
-                required_ratio,
+                uncertainty,
                 surface,
                 d.bumper_m,
                 d.size_m,
@@ -87,7 +89,7 @@ class Presenter:
 
 def is_sphere(projection: ViewProjection) -> bool:
     """Whether a player should show the view as a sphere: the full equirectangular panorama."""
-    return isinstance(projection, Equirectangular) and projection.width_px == 2 * projection.height_px
+    return isinstance(projection, EquirectangularView) and projection.width_px == 2 * projection.height_px
 
 
 def needs_height(projection: ViewProjection) -> bool:

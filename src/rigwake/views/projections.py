@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake._types import Array
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.surface import Surface, level_directions, water_range_m
 
 _BOWL_STEPS = 40
@@ -36,12 +36,12 @@ class ViewProjection(Protocol):
     def height_px(self) -> int:
         """Height of the view."""
 
-    def points_level(self, pixels: Array, attitude: Attitude, surface: Surface) -> Array:
+    def points_level(self, pixels: Array, attitude: LevelAttitude, surface: Surface) -> Array:
         """(N, 3) points in the level frame, metres, that pixels (N, 2) look at; NaN where they look at nothing."""
 
 
 @dataclass(frozen=True)
-class Equirectangular:
+class EquirectangularView:
     """The whole sphere: columns are azimuths from -180 to 180 degrees, rows elevations from 90 to -90."""
 
     equal_angles: ClassVar[bool] = True
@@ -60,14 +60,14 @@ class Equirectangular:
         column = np.mod(azimuth + np.pi, 2 * np.pi) / (2 * np.pi) * self.width_px - 0.5
         return np.stack([column, (np.pi / 2 - elevation) / np.pi * self.height_px - 0.5], axis=-1)
 
-    def points_level(self, pixels: Array, attitude: Attitude, surface: Surface) -> Array:
+    def points_level(self, pixels: Array, attitude: LevelAttitude, surface: Surface) -> Array:
         """As `ViewProjection.points_level`."""
         d = self.directions(pixels)
         return d * surface.range_m(d, attitude)[:, None]
 
 
 @dataclass(frozen=True)
-class Cylinder:
+class CylinderView:
     """All around with upright things upright: columns are azimuths, rows tangents of the elevation."""
 
     equal_angles: ClassVar[bool] = True
@@ -84,7 +84,7 @@ class Cylinder:
         slope = top + (pixels[:, 1] + 0.5) / self.height_px * (bottom - top)
         return level_directions(azimuth, np.arctan(slope))
 
-    def points_level(self, pixels: Array, attitude: Attitude, surface: Surface) -> Array:
+    def points_level(self, pixels: Array, attitude: LevelAttitude, surface: Surface) -> Array:
         """As `ViewProjection.points_level`."""
         d = self.directions(pixels)
         return d * surface.range_m(d, attitude)[:, None]
@@ -106,7 +106,7 @@ class VirtualCamera:
         """(N, 3) unit vectors in the level frame."""
         return _turned(_pinhole_rays(self, pixels), self.azimuth_deg, self.elevation_deg)
 
-    def points_level(self, pixels: Array, attitude: Attitude, surface: Surface) -> Array:
+    def points_level(self, pixels: Array, attitude: LevelAttitude, surface: Surface) -> Array:
         """As `ViewProjection.points_level`."""
         d = self.directions(pixels)
         return d * surface.range_m(d, attitude)[:, None]
@@ -142,7 +142,7 @@ class TopDown:
         row = (self.height_px - 1) / 2 - metres[..., 0] * self.px_per_m
         return np.stack([column, row], axis=-1)
 
-    def points_level(self, pixels: Array, attitude: Attitude, surface: Surface) -> Array:
+    def points_level(self, pixels: Array, attitude: LevelAttitude, surface: Surface) -> Array:
         """As `ViewProjection.points_level`; raises UsageError if the height above the water is unknown."""
         water_range_m(np.zeros((0, 3)), attitude.height_m)
         metres = self.metres(pixels)
@@ -172,7 +172,7 @@ class Bowl:
         """(N,) height of the bowl above the water at horizontal distances from the viewpoint."""
         return self.rise_per_m * np.maximum(distance_m - self.flat_m, 0.0) ** 2
 
-    def points_level(self, pixels: Array, attitude: Attitude, surface: Surface) -> Array:
+    def points_level(self, pixels: Array, attitude: LevelAttitude, surface: Surface) -> Array:
         """As `ViewProjection.points_level`: where the ray from the eye last leaves the inside of the bowl."""
         water_range_m(np.zeros((0, 3)), attitude.height_m)
         back = level_directions(np.deg2rad(self.azimuth_deg), np.deg2rad(self.elevation_deg))

@@ -16,10 +16,11 @@ from rigwake.cameras.registry import camera_from_params
 from rigwake.errors import InputError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.readers.rig_file import read_rig_file, read_yaml_mapping
+from rigwake.readers.rig_file import read_rig_file
 from rigwake.readers.truth_files import read_true_rig
 from rigwake.recording import Recording
 from rigwake.rig import Rig, RigCamera
+from rigwake.yaml_input import read_yaml_settings
 
 _MAX_BYTES = 2**20
 _NEEDED = ("camera_matrix", "dist_coeffs", "resolution", "project_matrix")
@@ -46,7 +47,7 @@ def read_rig_source(path: Path | str, recording: Recording | None = None) -> Rig
         raise InputError(
             f"There is no {path}.", remedy="Give the calibration.yaml that `rigwake calibrate` wrote."
         )
-    content = read_yaml_mapping(path)
+    content = read_yaml_settings(path)
     if "rigwake_calibration" in content:
         calibration = load_calibration(path)
         return RigSource(_with_lenses(calibration.rig, recording), calibration)

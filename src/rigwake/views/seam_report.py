@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 
 from rigwake._types import Image
-from rigwake.views.gain import CameraBlame, blame_cameras
 from rigwake.views.prepare import SurroundSetup
-from rigwake.views.projections import Cylinder
+from rigwake.views.projections import CylinderView
+from rigwake.views.seam_blame import CameraBlame, blame_cameras
 from rigwake.views.seams import PX_PER_RAD, RANGE_EDGES_M, SeamMatches, SeamMeter
 from rigwake.views.surround_view import SurroundView, blind_sectors
 
@@ -76,14 +76,14 @@ class SeamReport:
     """All seams of a rig. blind_deg: sectors (from, to), degrees to starboard, that no camera sees."""
 
     seams: tuple[Seam, ...]
-    gains: tuple[CameraBlame, ...]
+    blames: tuple[CameraBlame, ...]
     blind_deg: tuple[tuple[float, float], ...]
     frame_sets: int
 
     @property
     def to_blame(self) -> tuple[CameraBlame, ...]:
         """The cameras that stand out."""
-        return tuple(gain for gain in self.gains if gain.is_to_blame)
+        return tuple(blame for blame in self.blames if blame.is_to_blame)
 
     def lines(self) -> list[str]:
         """What a person reads at the end."""
@@ -91,8 +91,8 @@ class SeamReport:
             "No two cameras overlap: there is no seam to measure."
         ]
         lines += [
-            f"{gain.name} is turned by {gain.size_deg:.1f} deg against what the other cameras agree on"
-            for gain in self.to_blame
+            f"{blame.name} is turned by {blame.size_deg:.1f} deg against what the other cameras agree on"
+            for blame in self.to_blame
         ]
         if self.blind_deg:
             sectors = ", ".join(f"{a:.0f} to {b:.0f}" for a, b in self.blind_deg)
@@ -113,11 +113,11 @@ def measure_report(setup: SurroundSetup) -> SeamReport:
         matches += meter.measure(frames, attitude, setup.surface_at(frames, attitude))
     frames = setup.samples[len(setup.samples) // 2]
     attitude = setup.attitude_at(frames)
-    view = SurroundView(setup.rig, Cylinder(), setup.masks)
-    gains = blame_cameras(setup.rig, attitude, setup.surface_at(frames, attitude), matches)
+    view = SurroundView(setup.rig, CylinderView(), setup.masks)
+    blames = blame_cameras(setup.rig, attitude, setup.surface_at(frames, attitude), matches)
     blind = blind_sectors(setup.rig, attitude, view.quality, frames.is_missing)
     return SeamReport(
-        tuple(seams_of(setup.rig.names, matches)), tuple(gains), tuple(blind), len(setup.samples)
+        tuple(seams_of(setup.rig.names, matches)), tuple(blames), tuple(blind), len(setup.samples)
     )
 
 
@@ -189,12 +189,12 @@ def report_to_dict(report: SeamReport, setup: SurroundSetup) -> dict[str, Any]:
         ],
         "cameras": [
             {
-                "name": gain.name,
-                "rotation_deg": [_number(x) for x in gain.rotation_deg],
-                "std_deg": _number(gain.std_deg),
-                "is_to_blame": gain.is_to_blame,
+                "name": blame.name,
+                "rotation_deg": [_number(x) for x in blame.rotation_deg],
+                "std_deg": _number(blame.std_deg),
+                "is_to_blame": blame.is_to_blame,
             }
-            for gain in report.gains
+            for blame in report.blames
         ],
         "blind_sectors_deg": [[_number(a), _number(b)] for a, b in report.blind_deg],
         "height_m": None if setup.height is None else _number(setup.height.height_m),
@@ -213,7 +213,7 @@ def report_page(report: SeamReport, setup: SurroundSetup, title: str) -> str:
     """One HTML page that loads nothing from elsewhere."""
     frames = setup.samples[len(setup.samples) // 2]
     attitude = setup.attitude_at(frames)
-    view = SurroundView(setup.rig, Cylinder(1600, 400, 25, -35), setup.masks, setup.colour)
+    view = SurroundView(setup.rig, CylinderView(1600, 400, 25, -35), setup.masks, setup.colour)
     picture = view.picture(frames, attitude, setup.surface_at(frames, attitude))
     _mark_seams(picture, report)
     parts = [
@@ -253,12 +253,12 @@ def seam_table(report: SeamReport) -> str:
 def camera_table(report: SeamReport) -> str:
     """The table of rotations as HTML."""
     rows = []
-    for gain in report.gains:
-        verdict = '<span class="bad">stands out</span>' if gain.is_to_blame else "agrees"
-        x, y, z = gain.rotation_deg
+    for blame in report.blames:
+        verdict = '<span class="bad">stands out</span>' if blame.is_to_blame else "agrees"
+        x, y, z = blame.rotation_deg
         rows.append(
-            f"<tr><td>{escape(gain.name)}</td><td class=n>{x:+.2f}</td><td class=n>{y:+.2f}</td>"
-            f"<td class=n>{z:+.2f}</td><td class=n>{gain.std_deg:.2f}</td><td>{verdict}</td></tr>"
+            f"<tr><td>{escape(blame.name)}</td><td class=n>{x:+.2f}</td><td class=n>{y:+.2f}</td>"
+            f"<td class=n>{z:+.2f}</td><td class=n>{blame.std_deg:.2f}</td><td>{verdict}</td></tr>"
         )
     heads = ["camera", "about ahead (deg)", "about port (deg)", "about up (deg)", "std (deg)", ""]
     return f"<table><tr>{''.join(f'<th>{h}</th>' for h in heads)}</tr>{''.join(rows)}</table>" if rows else ""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake._types import Array, Image
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.colour import ColourModel
 from rigwake.views.frames import FrameSet
 from rigwake.views.lookup import CoarseLookup, extended_pixels, interpolated_pixels
@@ -64,7 +64,7 @@ class SeamWindow:
         azimuth = self.azimuth - self.half_width + (pixels[:, 0] + 0.5) / PX_PER_RAD
         return level_directions(azimuth, self.top - (pixels[:, 1] + 0.5) / PX_PER_RAD)
 
-    def points_level(self, pixels: Array, attitude: Attitude, surface: Surface) -> Array:
+    def points_level(self, pixels: Array, attitude: LevelAttitude, surface: Surface) -> Array:
         """As `ViewProjection.points_level`."""
         d = self.directions(pixels)
         return d * surface.range_m(d, attitude)[:, None]
@@ -95,7 +95,7 @@ class SeamMatches:
     difference_raw: float
 
 
-def overlapping_pairs(rig: SurroundRig, attitude: Attitude) -> list[tuple[int, int, float, float]]:
+def overlapping_pairs(rig: SurroundRig, attitude: LevelAttitude) -> list[tuple[int, int, float, float]]:
     """Neighbours: first, second camera, azimuth in the middle of their overlap at the horizon, and its width (radians).
 
     Only pairs between which no third camera shows the middle better are neighbours.
@@ -141,7 +141,7 @@ class SeamMeter:
     def __init__(self, rig: SurroundRig, colour: ColourModel | None = None) -> None:
         self._rig, self._colour, self._quality = rig, colour, camera_quality(rig)
 
-    def measure(self, frames: FrameSet, attitude: Attitude, surface: Surface) -> list[SeamMatches]:
+    def measure(self, frames: FrameSet, attitude: LevelAttitude, surface: Surface) -> list[SeamMatches]:
         """Matches across every seam whose two cameras are there."""
         found = []
         for a, b, azimuth, overlap in overlapping_pairs(self._rig, attitude):
@@ -155,7 +155,7 @@ class SeamMeter:
     def _seam(
         self,
         frames: FrameSet,
-        attitude: Attitude,
+        attitude: LevelAttitude,
         surface: Surface,
         a: int,
         b: int,
@@ -188,7 +188,7 @@ class SeamMeter:
 
 
 def drawn_alone(
-    view: SurroundView, frames: FrameSet, attitude: Attitude, surface: Surface, camera: int
+    view: SurroundView, frames: FrameSet, attitude: LevelAttitude, surface: Surface, camera: int
 ) -> Image:
     """What one camera alone shows in the view."""
     others = np.ones(len(view.rig), dtype=np.bool_)
@@ -238,7 +238,7 @@ class _Resolved:
 @dataclass(frozen=True, eq=False)
 class _Geometry:
     rig: SurroundRig
-    attitude: Attitude
+    attitude: LevelAttitude
     lookup: CoarseLookup
     window: SeamWindow
     first: int

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake._types import Array, Image
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.surface import Surface, azimuth_elevation, level_directions
 from rigwake.views.surround_rig import SurroundRig
 
@@ -77,7 +77,7 @@ class LevelStrip:
     image: Image
     camera: NDArray[np.int8]
     names: tuple[str, ...]
-    attitude: Attitude
+    attitude: LevelAttitude
     timestamp_ns: int = 0
 
     @property
@@ -89,7 +89,7 @@ class LevelStrip:
 def level_strip(
     images: Mapping[str, Image],
     rig: SurroundRig,
-    attitude: Attitude,
+    attitude: LevelAttitude,
     surface: Surface,
     grid: StripGrid | None = None,
     masks: Mapping[str, NDArray[np.bool_]] | None = None,
@@ -116,7 +116,7 @@ def level_strip(
 def camera_strips(
     images: Mapping[str, Image],
     rig: SurroundRig,
-    attitude: Attitude,
+    attitude: LevelAttitude,
     surface: Surface,
     grid: StripGrid,
     masks: Mapping[str, NDArray[np.bool_]] | None = None,

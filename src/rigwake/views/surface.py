@@ -14,7 +14,7 @@ import numpy as np
 
 from rigwake._types import Array, Image
 from rigwake.errors import UsageError
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.surround_rig import SurroundRig
 
 SHELL_M = 40.0
@@ -25,7 +25,7 @@ _NEAREST_M = 0.3  # no surface is nearer than this to the viewpoint
 class Surface(Protocol):
     """The range of what is seen in a direction."""
 
-    def range_m(self, directions_level: Array, attitude: Attitude) -> Array:
+    def range_m(self, directions_level: Array, attitude: LevelAttitude) -> Array:
         """(N,) metres from the viewpoint along unit vectors (N, 3) in the level frame; finite and positive."""
 
 
@@ -33,7 +33,7 @@ class SurfaceSource(Protocol):
     """Gives a surface for every frame set: what stands on the water moves."""
 
     def surface(
-        self, images: Mapping[str, Image], rig: SurroundRig, attitude: Attitude, timestamp_ns: int
+        self, images: Mapping[str, Image], rig: SurroundRig, attitude: LevelAttitude, timestamp_ns: int
     ) -> Surface:
         """The surface at the time of these pictures ((H, W, 3) BGR, by camera name)."""
 
@@ -45,7 +45,7 @@ class FixedSurface:
     fixed: Surface
 
     def surface(
-        self, images: Mapping[str, Image], rig: SurroundRig, attitude: Attitude, timestamp_ns: int
+        self, images: Mapping[str, Image], rig: SurroundRig, attitude: LevelAttitude, timestamp_ns: int
     ) -> Surface:
         """As `SurfaceSource.surface`."""
         return self.fixed
@@ -91,7 +91,7 @@ class Shell:
 
     shell_m: float = SHELL_M
 
-    def range_m(self, directions_level: Array, attitude: Attitude) -> Array:
+    def range_m(self, directions_level: Array, attitude: LevelAttitude) -> Array:
         """As `Surface.range_m`."""
         return np.asarray(self.shell_m / _cosines(np.asarray(directions_level)))
 
@@ -102,7 +102,7 @@ class WaterAndShell:
 
     shell_m: float = SHELL_M
 
-    def range_m(self, directions_level: Array, attitude: Attitude) -> Array:
+    def range_m(self, directions_level: Array, attitude: LevelAttitude) -> Array:
         """As `Surface.range_m`; raises UsageError if the height is unknown."""
         d = np.asarray(directions_level, dtype=np.float64)
         water = water_range_m(d, attitude.height_m)
@@ -130,7 +130,7 @@ class WaterAndStixels:
             raise ValueError("distance_m and top_m must have the same shape (sectors, layers)")
         object.__setattr__(self, "_order", np.argsort(self.distance_m, axis=1))  # NaN last
 
-    def range_m(self, directions_level: Array, attitude: Attitude) -> Array:
+    def range_m(self, directions_level: Array, attitude: LevelAttitude) -> Array:
         """As `Surface.range_m`; the nearest layer that the ray meets counts."""
         d = np.asarray(directions_level, dtype=np.float64)
         azimuth, _ = azimuth_elevation(d)
@@ -166,7 +166,7 @@ class WaterAndDepth:
     step: float
     shell_m: float = SHELL_M
 
-    def range_m(self, directions_level: Array, attitude: Attitude) -> Array:
+    def range_m(self, directions_level: Array, attitude: LevelAttitude) -> Array:
         """As `Surface.range_m`."""
         d = np.asarray(directions_level, dtype=np.float64)
         azimuth, elevation = azimuth_elevation(d)

@@ -36,7 +36,7 @@ class SurroundRig:
     def cam_from_level(self, level_from_rig: Array) -> tuple[SE3, ...]:
         """`cam_from_level` of every camera; the level frame has its origin in the viewpoint.
 
-        level_from_rig: (3, 3) rotation (`Attitude.level_from_rig`).
+        level_from_rig: (3, 3) rotation (`LevelAttitude.level_from_rig`).
         """
         rig_from_level = SE3(np.asarray(level_from_rig).T, self.viewpoint_rig)
         return tuple(rig_from_cam.inverse() * rig_from_level for rig_from_cam in self.rig_from_cam)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigwake._types import Array, Floats, Image
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.colour import ColourModel, half_field
 from rigwake.views.compose import compose
 from rigwake.views.frames import FrameSet
@@ -37,7 +37,7 @@ class SurroundView:
     known_quality: CameraQuality | None = None
     quality: CameraQuality = field(init=False)
     _lookup: CoarseLookup | None = field(init=False, default=None)
-    _made_for: tuple[Attitude, Surface] | None = field(init=False, default=None)
+    _made_for: tuple[LevelAttitude, Surface] | None = field(init=False, default=None)
     _shading: Floats | None = field(init=False, default=None)
     _shading_of: ColourModel | None = field(init=False, default=None)
     _angles: list[tuple[Array, tuple[Array, Array]]] = field(init=False, default_factory=list)
@@ -45,7 +45,7 @@ class SurroundView:
     def __post_init__(self) -> None:
         self.quality = self.known_quality or camera_quality(self.rig, self.masks)
 
-    def lookup(self, attitude: Attitude, surface: Surface) -> CoarseLookup:
+    def lookup(self, attitude: LevelAttitude, surface: Surface) -> CoarseLookup:
         """Where the pixels of the view come from."""
         made_for = self._made_for
         if (
@@ -62,7 +62,7 @@ class SurroundView:
         return self._lookup
 
     def picture(
-        self, frames: FrameSet, attitude: Attitude, surface: Surface, out: Image | None = None
+        self, frames: FrameSet, attitude: LevelAttitude, surface: Surface, out: Image | None = None
     ) -> Image:
         """(H, W, 3) BGR. Cameras that are missing are replaced by their neighbours where these see."""
         full = self.lookup(attitude, surface)
@@ -87,7 +87,9 @@ class SurroundView:
             shading[camera] = colour.shading(angle / half_field(self.rig, camera))
         return shading
 
-    def missing_sectors(self, frames: FrameSet, attitude: Attitude, surface: Surface) -> NDArray[np.int8]:
+    def missing_sectors(
+        self, frames: FrameSet, attitude: LevelAttitude, surface: Surface
+    ) -> NDArray[np.int8]:
         """(H, W) index of the missing camera that would have shown a pixel, -1 elsewhere."""
         full = self.lookup(attitude, surface)
         best = np.where(full.weights.max(axis=0) > 0, full.weights.argmax(axis=0), -1)
@@ -96,7 +98,9 @@ class SurroundView:
         rows, columns = np.arange(full.height_px) // 8, np.arange(full.width_px) // 8
         return np.asarray(nodes[rows[:, None], columns[None, :]])
 
-    def blind_azimuths_deg(self, frames: FrameSet | None, attitude: Attitude) -> list[tuple[float, float]]:
+    def blind_azimuths_deg(
+        self, frames: FrameSet | None, attitude: LevelAttitude
+    ) -> list[tuple[float, float]]:
         """Sectors (from, to) in degrees to starboard in which no camera sees the horizon."""
         return blind_sectors(self.rig, attitude, self.quality, None if frames is None else frames.is_missing)
 
@@ -115,7 +119,7 @@ def _angle_table(rig: SurroundRig, camera: int) -> tuple[Array, tuple[Array, Arr
 
 def blind_sectors(
     rig: SurroundRig,
-    attitude: Attitude,
+    attitude: LevelAttitude,
     quality: CameraQuality,
     missing: NDArray[np.bool_] | None = None,
     elevation_deg: float = -3.0,

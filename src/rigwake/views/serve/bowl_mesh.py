@@ -7,7 +7,7 @@ import struct
 
 import numpy as np
 
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.lookup import extended_pixels
 from rigwake.views.projections import Bowl
 from rigwake.views.surround_view import SurroundView
@@ -17,7 +17,7 @@ _AROUND, _OUT = 144, 56
 _NEAREST_M, _FARTHEST_M = 0.6, 45.0
 
 
-def bowl_mesh(view: SurroundView, attitude: Attitude) -> bytes:
+def bowl_mesh(view: SurroundView, attitude: LevelAttitude) -> bytes:
     """The mesh as a message: length of a JSON header (uint32, little endian), the header, then float32 arrays.
 
     Arrays, for V vertices: positions (V, 3) in the level frame of `attitude`; then per camera u, v in [0, 1] and

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from rigwake.errors import RigwakeError
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.frames import FrameSet, frame_sets
 from rigwake.views.prepare import SurroundSetup
 from rigwake.views.surface import Surface
@@ -17,12 +17,12 @@ _MOST_LATE_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class LiveScene:
     """One frame set with its attitude and surface. number: counts up. taken_s: time of day when it was taken."""
 
     number: int
     frames: FrameSet
-    attitude: Attitude
+    attitude: LevelAttitude
     surface: Surface
     taken_s: float
 
@@ -31,14 +31,14 @@ class Newest:
     """Holds the newest scene. Threads put, anybody may look."""
 
     def __init__(self) -> None:
-        self._scene: Scene | None = None
+        self._scene: LiveScene | None = None
         self._listeners: list[Callable[[], None]] = []
         self.error = ""
 
-    def put(self, frames: FrameSet, attitude: Attitude, surface: Surface, taken_s: float) -> None:
+    def put(self, frames: FrameSet, attitude: LevelAttitude, surface: Surface, taken_s: float) -> None:
         """Replace the scene and tell the listeners."""
         number = 1 if self._scene is None else self._scene.number + 1
-        self._scene = Scene(number, frames, attitude, surface, taken_s)
+        self._scene = LiveScene(number, frames, attitude, surface, taken_s)
         for listener in self._listeners:
             listener()
 
@@ -48,7 +48,7 @@ class Newest:
         for listener in self._listeners:
             listener()
 
-    def get(self) -> Scene | None:
+    def get(self) -> LiveScene | None:
         """The newest scene, None before the first."""
         return self._scene
 

@@ -16,9 +16,9 @@ from rigwake._types import Image, Mask
 from rigwake.errors import UsageError
 from rigwake.views.colour import ColourModel
 from rigwake.views.present import Decoration, Presenter
-from rigwake.views.projections import Cylinder, TopDown
+from rigwake.views.projections import CylinderView, TopDown
 from rigwake.views.serve.bowl_mesh import bowl_mesh
-from rigwake.views.serve.feed import Scene
+from rigwake.views.serve.feed import LiveScene
 from rigwake.views.surround_rig import SurroundRig
 from rigwake.views.surround_view import SurroundView
 
@@ -42,7 +42,7 @@ class Screens:
         self.is_height_known = is_height_known
         self._presenters = {}
         for name, projection in (
-            ("panorama", Cylinder(1600, 500, 32.0, -42.0)),
+            ("panorama", CylinderView(1600, 500, 32.0, -42.0)),
             ("topdown", TopDown(800, 800)),
         ):
             view = SurroundView(rig, projection, masks, colour)
@@ -56,7 +56,7 @@ class Screens:
         for presenter in self._presenters.values():
             presenter.view.colour = colour
 
-    def message(self, scene: Scene, screen: str, camera: str) -> bytes:
+    def message(self, scene: LiveScene, screen: str, camera: str) -> bytes:
         """A binary message: length of a JSON header (uint32, little endian), the header, JPEG pictures.
 
         The header holds kind, number, taken_s, missing, and the lengths of the pictures. UsageError for an unknown
@@ -78,14 +78,14 @@ class Screens:
             self._drawn[key] = (scene.number, message)
             return message
 
-    def mesh(self, scene: Scene) -> bytes:
+    def mesh(self, scene: LiveScene) -> bytes:
         """The mesh of the bowl, made at the first scene."""
         with self._lock:
             if self._mesh is None:
                 self._mesh = bowl_mesh(self._presenters["panorama"].view, scene.attitude)
             return self._mesh
 
-    def _bias_response(self, scene: Scene, screen: str, camera: str) -> bytes:
+    def _bias_response(self, scene: LiveScene, screen: str, camera: str) -> bytes:
         header: dict[str, Any] = {
             "kind": screen,
             "number": scene.number,
@@ -111,7 +111,7 @@ class Screens:
         colour = self._presenters["panorama"].view.colour
         return np.ones((len(self.rig), 3)) if colour is None else colour.gains.astype(float)
 
-    def _camera(self, scene: Scene, name: str, width_px: int | None) -> Image | None:
+    def _camera(self, scene: LiveScene, name: str, width_px: int | None) -> Image | None:
         """A camera's own picture; None if it is missing."""
         picture = scene.frames.images(self.rig).get(name)
         if picture is None:

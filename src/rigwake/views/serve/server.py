@@ -23,7 +23,7 @@ from websockets.http11 import Request, Response
 from rigwake.errors import RigwakeError, UsageError
 from rigwake.views.prepare import SurroundSetup
 from rigwake.views.present import Decoration
-from rigwake.views.serve.feed import Newest, RecordingFeed, Scene
+from rigwake.views.serve.feed import LiveScene, Newest, RecordingFeed
 from rigwake.views.serve.screens import Screens
 
 _FILES = {
@@ -124,7 +124,7 @@ class LiveServer:
                 seen = scene.number
                 await connection.send(await self._answer_to(wanted, scene))
 
-    async def _answer_to(self, wanted: dict[str, Any], scene: Scene) -> bytes | str:
+    async def _answer_to(self, wanted: dict[str, Any], scene: LiveScene) -> bytes | str:
         screen, camera = str(wanted.get("view", "")), str(wanted.get("camera", ""))
         try:
             if screen == "mesh":
@@ -137,7 +137,7 @@ class LiveServer:
         except RigwakeError as error:
             return json.dumps({"kind": "refused", "words": str(error)})
 
-    async def _newer_than(self, seen: int) -> Scene | None:
+    async def _newer_than(self, seen: int) -> LiveScene | None:
         """The newest scene once it is newer than `seen`; None if none comes in time."""
         assert self._news is not None
 

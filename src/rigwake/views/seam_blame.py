@@ -9,7 +9,7 @@ import numpy as np
 
 from rigwake._types import Array
 from rigwake.geometry.so3 import hat
-from rigwake.views.attitude import Attitude
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.seams import PX_PER_RAD, SeamMatches
 from rigwake.views.surface import Surface
 from rigwake.views.surround_rig import SurroundRig
@@ -45,7 +45,7 @@ _LEAST_BLAME_DEG = 0.25
 
 
 def blame_cameras(
-    rig: SurroundRig, attitude: Attitude, surface: Surface, seams: Iterable[SeamMatches]
+    rig: SurroundRig, attitude: LevelAttitude, surface: Surface, seams: Iterable[SeamMatches]
 ) -> list[CameraBlame]:
     """Small rotations of all cameras that explain the misalignments, relative to the median camera.
 
@@ -97,7 +97,7 @@ def _blames(rig: SurroundRig, turns: Array, covariance: Array, owners: set[int])
     known = sorted(owners)
     turns = turns - np.median(turns[known], axis=0)
     sizes = {k: float(np.rad2deg(np.linalg.norm(turns[k]))) for k in known}
-    gains = []
+    blames = []
     for k in known:
         block = covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] + np.diag(_LEAST_STD) ** 2
         std = float(np.rad2deg(np.sqrt(np.trace(block) / 3)))
@@ -106,8 +106,8 @@ def _blames(rig: SurroundRig, turns: Array, covariance: Array, owners: set[int])
         stands_out = len(known) >= 3 and sizes[k] > max(_LEAST_BLAME_DEG, 2 * others) and sigmas > _DISTINCT
 
         x, y, z = np.rad2deg(turns[k]).tolist()
-        gains.append(CameraBlame(rig.names[k], (x, y, z), std, stands_out))
-    return gains
+        blames.append(CameraBlame(rig.names[k], (x, y, z), std, stands_out))
+    return blames
 
 
 def _robust(A: Array, y: Array, prior_std: Array) -> tuple[Array, Array]:

@@ -1,0 +1,93 @@
+"""`rigwake monitor CALIB REC`: has a camera moved since it was calibrated?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from rigwake.cli.console import next_step, out, progress_bars, write_json
+from rigwake.cli.options import CameraFileOption, JsonOption, TopicOption, TopicsOption
+
+_COLOURS = {
+    "OK": "green",
+    "SUSPECT": "yellow",
+    "DRIFTED": "red",
+    "RECALIBRATING": "cyan",
+    "UNOBSERVABLE": "yellow",
+}
+
+
+def command(
+    calibration: Annotated[Path, typer.Argument(help="calibration.yaml of this vessel.")],
+    recording: Annotated[Path, typer.Argument(help="What it recorded later: ROS bag, MCAP, folder.")],
+    out_folder: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder for monitor.html and monitor.json.")
+    ] = None,
+    log: Annotated[
+        Path | None, typer.Option("--log", metavar="VESSEL.db", help="Logbook that the verdicts go into.")
+    ] = None,
+    topic: TopicOption = None,
+    topics: TopicsOption = None,
+    camera_file: CameraFileOption = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Has a camera moved since it was calibrated, or during this recording?
+
+    Exit code 0: all cameras are where they were. 5: a camera, a clock or the IMU is not. 3: the motion cannot tell.
+
+    Example: [cyan]rigwake monitor calibration.yaml today.bag -o OUT --log vessel.db[/cyan]
+    """
+    from rigwake.calibration import load_calibration
+    from rigwake.logbook.store import Logbook
+    from rigwake.monitor.monitor_page import write_page
+    from rigwake.monitor.monitor_report import logged_verdicts, result_to_dict, verdict_line
+    from rigwake.monitor.run import monitor
+    from rigwake.readers.open import open_recording
+    from rigwake.readers.topics import TopicMap
+
+    calibrated = load_calibration(calibration)
+    if log is not None:
+        with Logbook(log, create=True):
+            pass  # what is wrong with it is told before the work
+    opened = open_recording(recording, TopicMap.from_options(topic or (), topics, camera_file or ()))
+    with progress_bars() as bars:
+        result = monitor(calibrated, opened, bars)
+    content = result_to_dict(result)
+    if json_file is not None:
+        write_json(json_file, content)
+    if out_folder is not None:
+        write_json(out_folder / "monitor.json", content)
+        write_page(result, opened, out_folder / "monitor.html")
+    if log is not None:
+        with Logbook(log, create=True) as book:
+            number = book.find(calibrated)
+            if number is None:
+                number = book.add(calibrated, _valid_from(calibrated, opened), note=calibration.name)
+            book.add_verdicts(number, logged_verdicts(result, recording))
+    if str(json_file) != "-":
+        for verdict in result.verdicts.values():
+            line = verdict_line(verdict, f"rigwake recalibrate {calibration} {recording} -o NEW.yaml")
+            state = str(verdict.state)
+            out.print(
+                escape(line).replace(state, f"[{_COLOURS[state]}]{state}[/]", 1),
+                soft_wrap=True,
+                highlight=False,
+            )
+        for note in result.notes:
+            out.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
+        if result.blamed:
+            next_step(
+                f"rigwake recalibrate {calibration} {recording} -o NEW.yaml", "measure the camera that moved"
+            )
+        elif out_folder is not None:
+            next_step(f"open {out_folder / 'monitor.html'}", "see the timeline")
+    if result.exit_code:
+        raise typer.Exit(result.exit_code)
+
+
+def _valid_from(calibrated, opened) -> int:  # type: ignore[no-untyped-def]
+    """A calibration that was never logged holds from this recording on, as far as the logbook knows."""
+    return min(int(camera.timestamps_ns[0]) for camera in opened.cameras.values() if len(camera))

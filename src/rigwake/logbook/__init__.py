@@ -1,0 +1,1 @@
+"""The history of a vessel's calibrations in one file."""

@@ -1,0 +1,1 @@
+"""Has a camera moved since it was calibrated?"""

@@ -1,0 +1,355 @@
+"""`monitor`: from a calibration and a recording to what is said of every camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rigwake._types import Array, Indices
+from rigwake.calibration import Calibration
+from rigwake.errors import EstimationError, UnobservableError
+from rigwake.geometry import so3
+from rigwake.geometry.se3 import SE3
+from rigwake.monitor.blame import Explanation
+from rigwake.monitor.change_detection import Change
+from rigwake.monitor.innovations import belief_of
+from rigwake.monitor.judge import Alarm, Judgement, judge_blocks
+from rigwake.monitor.rig_motion import RigMotion, rig_motion
+from rigwake.monitor.score import BLOCK_S, BlockScores, block_starts, score_blocks
+from rigwake.monitor.states import CameraState
+from rigwake.monitor.thresholds import Thresholds
+from rigwake.monitor.vessel_rig import AXIS_REMEDIES, AXIS_WORDS, MonitoredRig, camera_axes, prepare_rig
+from rigwake.recording import Recording
+from rigwake.rig import Rig
+from rigwake.tracking.front_ends import track_camera
+from rigwake.tracking.masks import lens_mask
+from rigwake.tracking.self_mask import find_self_mask
+from rigwake.tracking.tracking_options import TrackingOptions
+from rigwake.tracks import Tracks
+
+Progress = Callable[[str, str, float], None]
+"""Told a camera (or `monitor`), what is being done, and which fraction of it is done."""
+
+_FEWEST_BLOCKS = 2
+_REFINE_ROUNDS = 3
+_REFINE_BLOCKS = 12
+
+
+def _silent(name: str, what: str, fraction: float) -> None:
+    """Progress that nobody asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraVerdict:
+    """What is said of one camera at the end.
+
+    state: the last. std_deg: (3,) about `AXIS_WORDS`, of a step over the last blocks. rotation, covariance: of a drift,
+    rad, rig axes of the calibration, else None. since_ns: when it began. alarm: if there was one. words: one line.
+    """
+
+    name: str
+    state: CameraState
+    std_deg: Array
+    words: str
+    rotation: Array | None = None
+    covariance: Array | None = None
+    since_ns: int | None = None
+    alarm: Alarm | None = None
+    kind: str = ""
+    rate_deg_per_hour: float = 0.0
+
+    @property
+    def size_deg(self) -> float | None:
+        """Of a drift."""
+        return None if self.rotation is None else float(np.rad2deg(np.linalg.norm(self.rotation)))
+
+    @property
+    def size_std_deg(self) -> float | None:
+        """Standard deviation of `size_deg`."""
+        if self.rotation is None or self.covariance is None:
+            return None
+        along = self.rotation / max(float(np.linalg.norm(self.rotation)), 1e-12)
+        return float(np.rad2deg(np.sqrt(along @ self.covariance @ along)))
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorResult:
+    """verdicts: by camera. judgement: block by block. notes: in words. monitored: in the IMU's frame."""
+
+    verdicts: Mapping[str, CameraVerdict]
+    judgement: Judgement
+    monitored: MonitoredRig
+    motion: RigMotion
+    tracks: Mapping[str, Tracks]
+    notes: tuple[str, ...] = ()
+    thresholds: Thresholds = field(default_factory=Thresholds)
+
+    @property
+    def exit_code(self) -> int:
+        """5: something moved, a camera or what an alarm was explained by; 3: not every camera could be told; else 0."""
+        states = {verdict.state for verdict in self.verdicts.values()}
+        if CameraState.DRIFTED in states or self.judgement.alarms:
+            return 5
+        return 3 if states & {CameraState.UNOBSERVABLE, CameraState.SUSPECT} else 0
+
+    @property
+    def blamed(self) -> tuple[str, ...]:
+        """Cameras that drifted."""
+        return tuple(name for name, v in self.verdicts.items() if v.state is CameraState.DRIFTED)
+
+
+def monitor(
+    calibration: Calibration,
+    recording: Recording,
+    progress: Progress = _silent,
+    *,
+    tracks: Mapping[str, Tracks] | None = None,
+    thresholds: Thresholds | None = None,
+    tracking: TrackingOptions | None = None,
+) -> MonitorResult:
+    """Has a camera moved since it was calibrated, or while this was recorded?
+
+    tracks: by camera, where they exist already; by default the images are tracked. Raises InputError where the
+    recording is not of the calibrated vessel or lacks an IMU, UnobservableError where it is too short or one camera's.
+    """
+    thresholds = thresholds or Thresholds()
+    monitored = prepare_rig(calibration, recording)
+    motion = rig_motion(monitored.imu, monitored.gnss, monitored.calibration.antenna_rig)
+    _require_length(monitored, motion)
+    notes: list[str] = [f"{name}: {why}" for name, why in monitored.left_out.items()]
+    if tracks is None:
+        tracks = track_rig(monitored, motion, tracking or TrackingOptions(), progress, notes)
+    starts = block_starts(tracks, monitored.rig, motion)
+    if len(starts) < _FEWEST_BLOCKS:
+        _too_short(len(starts) * BLOCK_S)
+    progress("monitor", "scoring", 0.0)
+    scores = score_blocks(tracks, monitored.rig, motion, starts_ns=starts)
+    belief = belief_of(monitored.calibration, scores.cameras, thresholds)
+    up = scores.gravity.mean(axis=0)
+    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0.0, 0.0, 1.0])
+    axes = camera_axes(monitored.rig, up)
+    judgement = judge_blocks(scores, belief, monitored.places, thresholds, axes)
+    progress("monitor", "measuring what moved", 0.8)
+    verdicts = {
+        name: _verdict(name, judgement, tracks, monitored, motion, axes[k], thresholds)
+        for k, name in enumerate(scores.cameras)
+    }
+    for name, why in monitored.left_out.items():
+        verdicts[name] = CameraVerdict(name, CameraState.UNOBSERVABLE, np.full(3, np.inf), why)
+    notes += rig_notes(judgement, thresholds)
+    return MonitorResult(verdicts, judgement, monitored, motion, tracks, tuple(notes), thresholds)
+
+
+def _require_length(monitored: MonitoredRig, motion: RigMotion) -> None:
+    stamps = [stream.timestamps_ns for stream in monitored.streams.values() if len(stream)]
+    if not stamps:
+        raise UnobservableError(
+            "The recording holds no images.", remedy="`rigwake inspect` shows what it holds."
+        )
+    first = max(min(int(s[0]) for s in stamps), int(motion.timestamps_ns[0]))
+    last = min(max(int(s[-1]) for s in stamps), int(motion.timestamps_ns[-1]))
+    if (last - first) * 1e-9 < _FEWEST_BLOCKS * BLOCK_S:
+        _too_short(max(last - first, 0) * 1e-9)
+
+
+def _too_short(seconds: float) -> None:
+    raise UnobservableError(
+        f"Images and IMU share {seconds:.0f} s; {_FEWEST_BLOCKS} blocks of {BLOCK_S:g} s are the least.",
+        consequence="Nothing can be said of any camera.",
+        remedy="Record half a minute or more, with turns.",
+    )
+
+
+def track_rig(
+    monitored: MonitoredRig,
+    motion: RigMotion,
+    options: TrackingOptions,
+    progress: Progress = _silent,
+    notes: list[str] | None = None,
+) -> dict[str, Tracks]:
+    """Tracks of all cameras above the horizon, which the calibration and the IMU tell, beside the own hull."""
+    tracks = {}
+    for name, stream in monitored.streams.items():
+        camera = monitored.rig.camera(name)
+        mask = lens_mask(stream)
+        try:
+            mask = mask.with_region("hull", find_self_mask(stream, mask.usable))
+        except (UnobservableError, EstimationError) as error:
+            if notes is not None:
+                notes.append(f"{name}: own hull not looked for: {error.cause}")
+        on_rig = stream.timestamps_ns + round(camera.time_offset_s * 1e9)
+        up_cam = motion.up_rig_at(on_rig) @ camera.rig_from_cam.rotation
+        tracks[name] = track_camera(
+            stream, options, mask, up_cam=up_cam, progress=_fraction(progress, name, len(stream))
+        )
+    return tracks
+
+
+def _fraction(progress: Progress, name: str, total: int) -> Callable[[int], None]:
+    return lambda done: progress(name, "tracking", done / max(total, 1))
+
+
+def refined_step(
+    tracks: Mapping[str, Tracks],
+    rig: Rig,
+    motion: RigMotion,
+    camera: str,
+    rotation: Array,
+    starts_ns: Indices,
+) -> tuple[Array, Array, BlockScores]:
+    """A camera's rotation (3,) rad against `rig`, its noise covariance (3, 3), and the blocks' scores at it.
+
+    The blocks after the change are scored again with the camera turned, until nothing is left to turn: residuals of
+    half a degree are not small. rotation: a first value.
+    """
+    k = list(rig.cameras).index(camera)
+    scores, covariance = None, np.full((3, 3), np.nan)
+    for _ in range(_REFINE_ROUNDS):
+        scores = score_blocks(tracks, _turned(rig, camera, rotation), motion, starts_ns=starts_ns)
+        at = scores.columns(k)
+        H, g = scores.H[:, at, at].sum(axis=0), scores.g[:, at].sum(axis=0)
+        noise = np.einsum("bij,b->ij", scores.H[:, at, at], scores.inflation[:, k])
+        inverse = np.linalg.pinv(H, rcond=1e-9, hermitian=True)
+        rotation = so3.log(so3.exp(inverse @ g) @ so3.exp(rotation))
+        covariance = inverse @ noise @ inverse
+    assert scores is not None
+    return rotation, covariance, scores
+
+
+def _turned(rig: Rig, camera: str, rotation: Array) -> Rig:
+    mounted = rig.camera(camera)
+    moved = SE3(so3.exp(rotation) @ mounted.rig_from_cam.rotation, mounted.rig_from_cam.translation)
+    return replace(rig, cameras={**rig.cameras, camera: replace(mounted, rig_from_cam=moved)})
+
+
+def _verdict(
+    name: str,
+    judgement: Judgement,
+    tracks: Mapping[str, Tracks],
+    monitored: MonitoredRig,
+    motion: RigMotion,
+    axes: Array,
+    thresholds: Thresholds,
+) -> CameraVerdict:
+    scores = judgement.scores
+    k = scores.cameras.index(name)
+    state, std = judgement.standings[-1][k], judgement.statistics.std_deg[-1, k]
+    alarm = judgement.alarm_of(name)
+    if state is CameraState.DRIFTED and alarm is not None and alarm.change is not None:
+        return _drift(name, std, alarm, alarm.change, scores, tracks, monitored, motion, axes)
+    if state is CameraState.SUSPECT:
+        words = alarm.words if alarm is not None else "disagrees with the other cameras; watch it"
+        return CameraVerdict(name, state, std, words, alarm=alarm)
+    if state is CameraState.UNOBSERVABLE:
+        return CameraVerdict(name, state, std, unobservable_words(scores, std, k, thresholds))
+    return CameraVerdict(name, state, std, f"to {max(5 * float(std.max()), 0.01):.2f} deg")
+
+
+def _drift(
+    name: str,
+    std: Array,
+    alarm: Alarm,
+    change: Change,
+    scores: BlockScores,
+    tracks: Mapping[str, Tracks],
+    monitored: MonitoredRig,
+    motion: RigMotion,
+    axes: Array,
+) -> CameraVerdict:
+    rotation, covariance = change.rotation, change.covariance
+    first = change.block
+    if change.kind == "step":
+        if len(scores) - first > 1 and change.evidence > 0:
+            first += 1  # the block in which it happened is of both kinds
+        last = min(len(scores), first + _REFINE_BLOCKS)
+        rotation, noise, _ = refined_step(
+            tracks, monitored.rig, motion, name, rotation, scores.starts_ns[first:last]
+        )
+        covariance = noise + change.covariance / 4
+    since = int(scores.starts_ns[change.block])
+    in_rig = monitored.rig_from_imu.rotation @ rotation
+    turned = monitored.rig_from_imu.rotation @ covariance @ monitored.rig_from_imu.rotation.T
+    verdict = CameraVerdict(
+        name,
+        CameraState.DRIFTED,
+        std,
+        "",
+        in_rig,
+        turned,
+        since,
+        alarm,
+        change.kind,
+        change.rate_deg_per_hour,
+    )
+    return replace(verdict, words=drift_words(verdict, axes @ rotation))
+
+
+def drift_words(verdict: CameraVerdict, about: Array) -> str:
+    """Size, axis, kind. about: (3,) the rotation about `AXIS_WORDS`."""
+    direction = np.abs(about) / max(float(np.linalg.norm(about)), 1e-12)
+    axis = AXIS_WORDS[int(np.argmax(direction))] if direction.max() > 0.9 else "an oblique axis"
+    parts = f"{verdict.size_deg:.2f} ± {verdict.size_std_deg:.2f} deg about {axis}"
+    if verdict.kind == "ramp":
+        return f"{parts}, {verdict.rate_deg_per_hour:.2f} deg per hour (ramp)"
+    return f"{parts} (step)"
+
+
+def unobservable_words(scores: BlockScores, std: Array, camera: int, thresholds: Thresholds) -> str:
+    """Which axes this motion did not show, why, and what would."""
+    recent = slice(max(len(scores) - thresholds.longest, 0), len(scores))
+    if not scores.rows[recent, camera].any():
+        return "nothing tracked: fog, darkness, a covered lens, or no way made"
+    blind = [AXIS_WORDS[a] for a in range(3) if std[a] > thresholds.observable_deg]
+    remedies = list(dict.fromkeys(AXIS_REMEDIES[a] for a in range(3) if std[a] > thresholds.observable_deg))
+    turning = np.rad2deg(float(np.median(scores.turning[recent])))
+    minutes = (recent.stop - recent.start) * BLOCK_S / 60
+    why = f"no turn in {minutes:.0f} min" if turning < 2.0 else "too little motion"
+    return f"about {' and '.join(blind)}: {why}; what helps: {', '.join(remedies)}"
+
+
+def rig_notes(judgement: Judgement, thresholds: Thresholds) -> list[str]:
+    """What concerns the whole rig: causes that no camera is blamed for, and a trim that changed."""
+    notes = [
+        alarm.words for alarm in judgement.alarms if not alarm.camera and not alarm.explanations[0].camera
+    ]
+    trim = trim_change(judgement.scores)
+    if trim is not None:
+        block, degrees = trim
+        imu_too = any(alarm.explanations[0].cause == "imu" for alarm in judgement.alarms)
+        cause = "the IMU turned on its mount" if imu_too else "the boat's trim or list changed"
+        notes.append(f"the level changed by {degrees:.1f} deg after {block * BLOCK_S / 60:.1f} min: {cause}")
+    return notes
+
+
+_TRIM_BLOCKS, _TRIM_LEAST_DEG, _TRIM_STDS = 6, 0.3, 6.0
+
+
+def trim_change(scores: BlockScores) -> tuple[int, float] | None:
+    """Block and degrees of the largest lasting change of the mean vertical on the rig; None if there is none."""
+    seen = np.flatnonzero(np.linalg.norm(scores.gravity, axis=1) > 0.5)
+    if len(seen) < 2 * _TRIM_BLOCKS:
+        return None
+    up = scores.gravity[seen]
+    best: tuple[float, int, float] | None = None
+    for at in range(_TRIM_BLOCKS, len(up) - _TRIM_BLOCKS + 1):
+        before, after = up[:at], up[at:]
+        change = after.mean(axis=0) - before.mean(axis=0)
+        spread = np.sqrt((before.var(axis=0).sum() / len(before)) + (after.var(axis=0).sum() / len(after)))
+        score = float(np.linalg.norm(change)) / max(float(spread), np.deg2rad(0.02))
+        if best is None or score > best[0]:
+            best = score, int(seen[at]), float(np.rad2deg(np.linalg.norm(change)))
+    if best is None or best[0] < _TRIM_STDS or best[2] < _TRIM_LEAST_DEG:
+        return None
+    return best[1], best[2]
+
+
+def explanation_to_dict(explanation: Explanation) -> dict[str, object]:
+    """Plain values for `--json`."""
+    return {
+        "cause": explanation.cause,
+        "camera": explanation.camera or None,
+        "words": explanation.words,
+        "evidence": explanation.evidence,
+    }

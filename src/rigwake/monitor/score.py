@@ -1,0 +1,409 @@
+"""Blocks of ten seconds: which small changes of the cameras' mountings and clocks would explain their tracks better?
+
+Every pair of frames a second apart gives epipolar residuals (`pair_kernels.py`). The rig's velocity (every pair), the
+gyro's noise (every pair) and its bias (every block) are unknown beside the changes of all cameras together, and are
+eliminated; what is left are normal equations `H x = g` of all cameras per block. A camera's step is then taken against
+the information-weighted mean of the others: an error that all cameras share moves the rig's motion instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from rigwake._types import Array, Indices
+from rigwake.monitor.frame_pairs import EpipolarPairs, pair_frames
+from rigwake.monitor.pair_kernels import COLUMNS, MOUNTING, accumulate, pair_residuals, sum_by
+from rigwake.monitor.rig_motion import PairMotion, RigMotion
+from rigwake.monitor.velocity import Slots, VelocityPriors, slots_of, solve_velocities, without_slow
+from rigwake.rig import Rig
+from rigwake.tracks import Tracks
+
+BLOCK_S = 10.0
+_SCORE_LOSS_STDS = 4.0  # of Cauchy's: a camera that moved must not be taken for outliers
+_LEAST_WAY_M = 0.25
+_FEWEST_ROWS = 60  # observations of a camera in a block
+_BELOW_HORIZON = float(np.sin(np.deg2rad(-1.0)))  # what is lower is taken for water
+_LARGEST_NOISE = 30.0
+_BIAS_START_STD, _BIAS_AGAIN_STD, _BIAS_LEAST_STD = 5e-3, 1e-3, 1e-4  # rad/s
+_NUISANCES = 6  # of a slot: rotation and velocity of the rig
+_SECTORS = 4  # of the image, around the optical axis
+_MAD_TO_STD = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class GyroBias:
+    """What is known of the gyro's bias beside what was taken off before: rad/s, and its standard deviation."""
+
+    value: Array
+    std: float
+
+    @classmethod
+    def unknown(cls) -> GyroBias:
+        """Before anything was seen."""
+        return cls(np.zeros(3), _BIAS_START_STD)
+
+
+@dataclass(frozen=True, eq=False)
+class BlockScores:
+    """Normal equations of B blocks for the changes of C cameras.
+
+    cameras: names. starts_ns: (B,) rig clock. H: (B, 7C, 7C), g: (B, 7C): per camera rotation (rad), translation (m)
+    and time offset (s), in rig axes, other unknowns eliminated. inflation: (B, C), by how much a camera's score
+    varies more than `H` says, from the scatter of whole tracks. noise: (B, C), residuals over what the tracks predict.
+    rows: (B, C) observations used. speed: (B,) m/s, turning: (B,) root mean square of the turn rate, rad/s.
+    gravity: (B, 3) mean direction against gravity in rig axes. sectors: (B, C, 4, 4, 4) of image quarters the normal
+    equations of a rotation alone: `[[H, g], [g, n]]`. bias: (B, 3) rad/s.
+    """
+
+    cameras: tuple[str, ...]
+    starts_ns: Indices
+    H: Array
+    g: Array
+    inflation: Array
+    noise: Array
+    rows: NDArray[np.int64]
+    speed: Array
+    turning: Array
+    gravity: Array
+    sectors: Array
+    bias: Array
+
+    def __len__(self) -> int:
+        return len(self.starts_ns)
+
+    def columns(self, camera: int, part: int = 0) -> slice:
+        """Where a camera's rotation (part 0), translation (1) or time offset (2) stands."""
+        first = MOUNTING * camera + 3 * part
+        return slice(first, first + (1 if part == 2 else 3))
+
+    def take(self, index: slice | NDArray[np.int64]) -> BlockScores:
+        """The chosen blocks."""
+        return BlockScores(
+            self.cameras,
+            self.starts_ns[index],
+            self.H[index],
+            self.g[index],
+            self.inflation[index],
+            self.noise[index],
+            self.rows[index],
+            self.speed[index],
+            self.turning[index],
+            self.gravity[index],
+            self.sectors[index],
+            self.bias[index],
+        )
+
+
+def join_blocks(parts: list[BlockScores]) -> BlockScores:
+    """Blocks of the same cameras, one after the other."""
+    names = (
+        "starts_ns",
+        "H",
+        "g",
+        "inflation",
+        "noise",
+        "rows",
+        "speed",
+        "turning",
+        "gravity",
+        "sectors",
+        "bias",
+    )
+    return BlockScores(
+        parts[0].cameras, *(np.concatenate([getattr(part, name) for part in parts]) for name in names)
+    )
+
+
+def score_blocks(
+    tracks: Mapping[str, Tracks],
+    rig: Rig,
+    motion: RigMotion,
+    *,
+    starts_ns: Indices | None = None,
+    bias: GyroBias | None = None,
+    stride: int = 1,
+) -> BlockScores:
+    """Score every block of a recording, in the order of time.
+
+    tracks: of every camera of the rig. rig: in the IMU's frame (`motion.py`), every number known. starts_ns: of the
+    blocks; from the first to the last frame by default. bias: of the gyro, where it is known from before.
+    """
+    if starts_ns is None:
+        starts_ns = block_starts(tracks, rig, motion)
+    bias = bias or GyroBias.unknown()
+    blocks = []
+    for start in starts_ns.tolist():
+        pairs = pair_frames(tracks, rig, start, start + round(BLOCK_S * 1e9), stride=stride)
+        block, found = score_block(pairs, rig, motion, start, bias)
+        if bias.std >= _BIAS_START_STD and found.std < bias.std:  # once more: it was linearised far off
+            block, found = score_block(pairs, rig, motion, start, GyroBias(found.value, _BIAS_AGAIN_STD))
+        bias = found
+        blocks.append(block)
+    if not blocks:
+        return _nothing(tuple(rig.cameras), np.empty(0, dtype=np.int64))
+    return join_blocks(blocks)
+
+
+def block_starts(tracks: Mapping[str, Tracks], rig: Rig, motion: RigMotion) -> Indices:
+    """Starts of whole blocks within the time that cameras and IMU cover."""
+    stamps = [
+        tracks[name].timestamps_ns + round(camera.time_offset_s * 1e9) for name, camera in rig.cameras.items()
+    ]
+    known = [s for s in stamps if len(s)]
+    if not known:
+        return np.empty(0, dtype=np.int64)
+    first = max(min(int(s[0]) for s in known), int(motion.timestamps_ns[0]))
+    last = min(max(int(s[-1]) for s in known), int(motion.timestamps_ns[-1]))
+    block = round(BLOCK_S * 1e9)
+    count = (
+        last - first + round(1.5e9)
+    ) // block  # pairs reach a second further; the last block may lack some
+    return first + block * np.arange(max(count, 0), dtype=np.int64)
+
+
+def score_block(
+    pairs: EpipolarPairs, rig: Rig, motion: RigMotion, start_ns: int, bias: GyroBias
+) -> tuple[BlockScores, GyroBias]:
+    """One block, and what is known of the gyro's bias after it."""
+    pairs = _above_water(pairs, motion)
+    size = MOUNTING * len(pairs.cameras)
+    empty = _nothing(pairs.cameras, np.array([start_ns], dtype=np.int64))
+    if len(pairs.pair) < _FEWEST_ROWS:
+        return empty, bias
+    place = np.stack([rig.camera(name).rig_from_cam.translation for name in pairs.cameras])[pairs.camera]
+    slots = slots_of(pairs, motion, _spacing(pairs))
+    between = motion.between(pairs.first_ns, pairs.second_ns, slots.reference_ns[slots.slot], bias.value)
+    spans = motion.between(slots.first_ns, slots.second_ns, slots.reference_ns, bias.value)
+    scale = np.ones(len(pairs.cameras))
+    priors = VelocityPriors.of(slots, spans, motion, bias.value)
+    velocity, way = solve_velocities(pairs, between, priors, place, scale[pairs.camera])
+    pairs = without_slow(pairs, way, _LEAST_WAY_M)
+    if len(pairs.pair) < _FEWEST_ROWS:
+        return empty, bias
+    for _ in range(2):
+        scale = _noise(_residuals(pairs, between.rotation, way), pairs)
+        velocity, way = solve_velocities(pairs, between, priors, place, scale[pairs.camera], velocity, 3)
+    residual = _residuals(pairs, between.rotation, way)
+    whitened = residual / (_SCORE_LOSS_STDS * scale[pairs.camera][pairs.pair])
+    weight = 1 / (1 + whitened**2) / scale[pairs.camera][pairs.pair] ** 2
+    products = np.zeros((len(pairs.camera), COLUMNS, COLUMNS))
+    rows = np.empty((len(pairs.pair), COLUMNS))
+    accumulate(
+        pairs.first,
+        pairs.second,
+        pairs.std,
+        weight,
+        pairs.pair,
+        between.rotation,
+        way,
+        between.by_velocity,
+        place,
+        between.turning,
+        between.drift,
+        between.turning_first,
+        products,
+        rows,
+    )
+    products = products + np.tril(products, -1).transpose(0, 2, 1)
+    H, g, new_bias = _eliminate(products, pairs, priors, velocity, motion.gyro_noise, bias)
+    counts = np.bincount(pairs.camera[pairs.pair], minlength=len(pairs.cameras))
+    poor = np.repeat(counts < _FEWEST_ROWS, MOUNTING)
+    H[poor, :], H[:, poor], g[poor] = 0.0, 0.0, 0.0
+    up = motion.up_rig_at(slots.reference_ns).mean(axis=0)
+    rates = np.linalg.norm(between.turning_first, axis=1)
+    block = BlockScores(
+        pairs.cameras,
+        np.array([start_ns], dtype=np.int64),
+        H.reshape(1, size, size),
+        g.reshape(1, size),
+        _inflation(rows, weight, pairs)[None],
+        scale[None],
+        counts[None],
+        np.array([float(np.median(np.linalg.norm(velocity, axis=1)))]),
+        np.array([float(np.sqrt(np.mean(rates**2)))]),
+        up[None] / np.linalg.norm(up),
+        _sectors(rows, weight, pairs)[None],
+        new_bias.value[None],
+    )
+    return block, new_bias
+
+
+def _above_water(pairs: EpipolarPairs, motion: RigMotion) -> EpipolarPairs:
+    """Without what lies below the horizon: water moves by itself."""
+    if not len(pairs.pair):
+        return pairs
+    up = motion.up_rig_at(pairs.first_ns)[pairs.pair]
+    kept = np.einsum("ni,ni->n", pairs.first, up) > _BELOW_HORIZON
+    return EpipolarPairs(
+        pairs.cameras,
+        pairs.camera,
+        pairs.first_ns,
+        pairs.second_ns,
+        pairs.first[kept],
+        pairs.second[kept],
+        pairs.std[kept],
+        pairs.pair[kept],
+        pairs.cluster[kept],
+        pairs.pixels[kept],
+    )
+
+
+def _spacing(pairs: EpipolarPairs) -> int:
+    """Nanoseconds between the starts of a camera's pairs."""
+    steps = np.diff(pairs.first_ns)[np.diff(pairs.camera) == 0]
+    return int(np.median(steps)) if len(steps) else round(1e9)
+
+
+def _pair_seconds(slots: Slots) -> float:
+    return float(np.median(slots.second_ns - slots.first_ns)) * 1e-9
+
+
+def _residuals(pairs: EpipolarPairs, rotation: Array, way: Array) -> Array:
+    residual = np.empty(len(pairs.pair))
+    pair_residuals(pairs.first, pairs.second, pairs.std, pairs.pair, rotation, way, residual)
+    return residual
+
+
+def _noise(residual: Array, pairs: EpipolarPairs) -> Array:
+    """(C,) how much larger a camera's residuals are than predicted, at least half."""
+    camera = pairs.camera[pairs.pair]
+    scale = np.ones(len(pairs.cameras))
+    for k in range(len(scale)):
+        of_camera = np.abs(residual[camera == k])
+        if len(of_camera):
+            scale[k] = np.clip(_MAD_TO_STD * float(np.median(of_camera)), 0.5, _LARGEST_NOISE)
+    return scale
+
+
+def _eliminate(
+    products: Array,
+    pairs: EpipolarPairs,
+    priors: VelocityPriors,
+    velocity: Array,
+    gyro_noise: float,
+    bias: GyroBias,
+) -> tuple[Array, Array, GyroBias]:
+    """Normal equations of all cameras' changes, without what else is unknown, and the gyro's bias that they give.
+
+    Unknown besides: per slot what the gyro's noise turned and the velocity; for the block an acceleration in level axes
+    (the level is not exact), the biases of accelerometer and gyro. Velocities of neighbouring slots differ by what the
+    accelerometer says.
+    """
+    slots = priors.slots
+    size, count = MOUNTING * len(pairs.cameras), len(slots.reference_ns)
+    known = _NUISANCES * count  # first the slots, then the block, then the changes
+    total = known + 9 + size
+    H, g = np.zeros((total, total)), np.zeros(total)
+    by_slot = np.zeros((count, total, _NUISANCES))
+    for k in range(len(pairs.cameras)):
+        rows = np.flatnonzero(pairs.camera == k)
+        part, slot = products[rows], slots.slot[rows]
+        at = slice(known + 9 + MOUNTING * k, known + 9 + MOUNTING * (k + 1))
+        H[at, at] += part[:, :MOUNTING, :MOUNTING].sum(axis=0)
+        g[at] += part[:, :MOUNTING, -1].sum(axis=0)
+        np.add.at(by_slot[:, at], slot, part[:, :MOUNTING, MOUNTING:-1])
+        for j in range(len(rows)):
+            own = slice(_NUISANCES * slot[j], _NUISANCES * (slot[j] + 1))
+            H[own, own] += part[j, MOUNTING:-1, MOUNTING:-1]
+            g[own] += part[j, MOUNTING:-1, -1]
+    H[known + 9 :, :known] = by_slot[:, known + 9 :].transpose(1, 0, 2).reshape(size, known)
+    H[:known, known + 9 :] = H[known + 9 :, :known].T
+    _add_rotation_priors(H, priors.spans, _pair_seconds(slots), gyro_noise, bias.std)
+    H_prior, g_prior = priors.normal_equations(velocity)
+    at = np.r_[(_NUISANCES * np.arange(count)[:, None] + [3, 4, 5]).ravel(), known : known + 9]
+    H[np.ix_(at, at)] += H_prior
+    g[at] += g_prior
+    H[range(known + 9), range(known + 9)] += 1e-9
+    factor = cho_factor(H[: known + 9, : known + 9], lower=True, check_finite=False)
+    cross = np.concatenate([H[: known + 9, known + 9 :], g[: known + 9, None]], axis=1)
+    of_bias = np.zeros((known + 9, 3))
+    of_bias[known + 6 :] = np.eye(3)
+    solution = cho_solve(factor, np.concatenate([cross, of_bias], axis=1), check_finite=False)
+    reduced = H[known + 9 :, known + 9 :] - cross[:, :-1].T @ solution[:, :size]
+    g_reduced = g[known + 9 :] - cross[:, :-1].T @ solution[:, size]
+    std = float(np.sqrt(np.linalg.eigvalsh(solution[known + 6 :, size + 1 :])[-1]))
+    found = GyroBias(bias.value + solution[known + 6 :, size], max(3 * std, _BIAS_LEAST_STD))
+    return (reduced + reduced.T) / 2, g_reduced, found
+
+
+def _add_rotation_priors(
+    H: Array, spans: PairMotion, seconds: float, gyro_noise: float, bias_std: float
+) -> None:
+    """The gyro's noise of each slot about its bias: `turned = by_bias @ bias + noise`."""
+    count = len(spans.by_bias)
+    # pairs overlap: each second's noise must not count as often as there are pairs in it
+    overlap = max(count * seconds / BLOCK_S, 1.0)
+    information = 1 / (gyro_noise**2 * seconds * overlap)
+    at_bias = slice(_NUISANCES * count + 6, _NUISANCES * count + 9)
+    for s, by_bias in enumerate(spans.by_bias):
+        turned = slice(_NUISANCES * s, _NUISANCES * s + 3)
+        H[turned, turned] += information * np.eye(3)
+        H[turned, at_bias] -= information * by_bias
+        H[at_bias, turned] -= information * by_bias.T
+        H[at_bias, at_bias] += information * by_bias.T @ by_bias
+    H[at_bias, at_bias] += bias_std**-2.0 * np.eye(3)
+
+
+def _inflation(rows: Array, weight: Array, pairs: EpipolarPairs) -> Array:
+    """(C,) variance of a rotation's score over what independent observations would give, from whole tracks."""
+    scores = rows[:, :3] * rows[:, -1:]
+    by_track = np.zeros((int(pairs.cluster.max()) + 1, 3))
+    sum_by(pairs.cluster, scores, weight, by_track)
+    camera_of = np.zeros(len(by_track), dtype=np.int64)
+    camera_of[pairs.cluster] = pairs.camera[pairs.pair]
+    camera_of_row = pairs.camera[pairs.pair]
+    inflation = np.ones(len(pairs.cameras))
+    for k in range(len(inflation)):
+        mine = camera_of_row == k
+        if not mine.any():
+            continue
+        H = np.einsum("ni,n,nj->ij", rows[mine, :3], weight[mine], rows[mine, :3])
+        clusters = by_track[camera_of == k]
+        clusters = clusters - clusters.mean(axis=0)
+        if np.linalg.eigvalsh(H)[0] > 0:
+            inflation[k] = max(float(np.trace(np.linalg.solve(H, clusters.T @ clusters))) / 3, 1.0)
+    return inflation
+
+
+def _sectors(rows: Array, weight: Array, pairs: EpipolarPairs) -> Array:
+    """(C, 4, 4, 4) normal equations of a rotation alone, by quarters of the image."""
+    result = np.zeros((len(pairs.cameras), _SECTORS, 4, 4))
+    camera = pairs.camera[pairs.pair]
+    picked = rows[:, [0, 1, 2, COLUMNS - 1]]
+    for k in range(len(pairs.cameras)):
+        mine = np.flatnonzero(camera == k)
+        if not len(mine):
+            continue
+        middle = np.median(pairs.pixels[mine], axis=0)
+        right, low = (pairs.pixels[mine] > middle).T
+        sector = 2 * low.astype(np.int64) + right
+        values = picked[mine]
+        sums = np.zeros((_SECTORS, 16))
+        sum_by(sector, (values[:, :, None] * values[:, None, :]).reshape(-1, 16), weight[mine], sums)
+        result[k] = sums.reshape(_SECTORS, 4, 4)
+    return result
+
+
+def _nothing(cameras: tuple[str, ...], starts_ns: Indices) -> BlockScores:
+    """Blocks that saw nothing."""
+    b, c = len(starts_ns), len(cameras)
+    size = MOUNTING * c
+    return BlockScores(
+        cameras,
+        starts_ns,
+        np.zeros((b, size, size)),
+        np.zeros((b, size)),
+        np.ones((b, c)),
+        np.ones((b, c)),
+        np.zeros((b, c), dtype=np.int64),
+        np.zeros(b),
+        np.zeros(b),
+        np.zeros((b, 3)),
+        np.zeros((b, c, _SECTORS, 4, 4)),
+        np.full((b, 3), np.nan),
+    )

@@ -1,0 +1,46 @@
+"""Numbers that decide, in one place: what an alarm takes, and what counts as seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigwake.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """alarm: of the likelihood ratio (chi-square of three), above which a camera has drifted; suspect: has perhaps;
+    calm: below which a suspicion ends. The figures in docs/monitor.md belong to the defaults.
+
+    clip: a block counts for no more than this many standard deviations.
+    margin: by how much (log likelihood) the blamed explanation must beat all others. observable_deg: an axis with a
+    larger standard deviation over the longest window is not observable. shortest, longest: blocks of a window;
+    steady_lag: blocks that what was steady before is away from it.
+    floor_deg: systematic error that no amount of data takes away.
+    calm_blocks: quiet blocks that end a suspicion. patience: blocks that blame may take.
+    """
+
+    alarm: float = 45.0
+    suspect: float = 30.0
+    calm: float = 16.0
+    clip: float = 8.0
+    shortest: int = 2
+    longest: int = 12
+    steady_lag: int = 6
+    margin: float = 3.0
+    observable_deg: float = 0.15
+    floor_deg: float = 0.005
+    calm_blocks: int = 3
+    patience: int = 3
+
+    def __post_init__(self) -> None:
+        if not 0 < self.calm < self.suspect <= self.alarm:
+            raise UsageError(
+                f"Thresholds must rise: calm {self.calm:g}, suspect {self.suspect:g}, alarm {self.alarm:g}."
+            )
+        if self.longest < 2 or self.clip <= 0 or not np.isfinite(self.alarm):
+            raise UsageError(
+                "A window needs two blocks or more, and clipping a positive number of deviations."
+            )
