@@ -316,7 +316,7 @@ def euroc(peers: bool) -> None:
     stream = recording.camera("cam0")
     started = time.process_time()
     imu = next(iter(recording.imus.values()))
-    result = run_camera(stream, imu, options=CameraOdometryOptions(hull=False, horizon=False))
+    result = run_camera(stream, imu, options=CameraOdometryOptions(hull=False, horizon="off"))
     cpu_s = time.process_time() - started
     path = DATA / "euroc_v101_micro" / "GT" / "V1_01_easy.csv"
     values = np.genfromtxt(path, delimiter=",", comments="#")

@@ -263,3 +263,24 @@ class TestClusters:
         solution = self.rig(0, 0.6)
         ratio = self.stds(solution, True) / self.stds(solution, False)
         assert np.median(ratio) > 1.5
+
+
+def test_a_direction_open_in_the_antenna_alone_leaves_the_cameras_determined() -> None:
+    """Turns about one axis leave the antenna's height open; points that both cameras see tie the cameras."""
+    wanted = Wanted(cameras=2, seconds=8.0, landmarks=80, imu=False, waves=0.0)
+    problem = free_cameras(true_problem(wanted), "rig_from_cam")
+    held = replace(problem.cameras[0], free=frozenset())
+    problem = replace(
+        problem, cameras=(held, problem.cameras[1]), antenna=replace(problem.antenna, free=True)
+    )
+    # at the true values: noise in the estimated states would add spurious a little information
+    solution = replace(solve(problem, SolverOptions(max_iterations=1)), problem=problem)
+    covariance = covariance_of(problem)
+    assert abs(covariance.fractions[0]) < 1e-7  # zero, but for rounding
+    covariance = replace(covariance, fractions=np.concatenate([[0.0], covariance.fractions[1:]]))
+    _, known = covariance.parameter("antenna", "position_rig")
+    assert not known.all()
+    assert covariance.parameter("cam1", "rig_from_cam")[1].all()
+    found = calibrated_cameras(solution, covariance, ReferenceFrame("cam0", None), {}, {}).cameras["cam1"]
+    assert found.observable_axes.all()
+    assert found.std_translation_m.max() < 0.1

@@ -1,6 +1,7 @@
 """The solver: recovery inside bounds, agreement with dense algebra, what cannot be determined, wrong input."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from rigwake.ba.solver.covariance import covariance_of
 from rigwake.ba.solver.envelope import Envelope, NotPositiveDefiniteError, cholesky
 from rigwake.ba.solver.extrapolation import extrapolated
 from rigwake.ba.solver.levenberg_marquardt import equations_of, linearised, solve, structure_of
+from rigwake.ba.solver.normal import NormalEquations, ReducedEquations
 from rigwake.ba.solver.parameter_layout import layout_of
 from rigwake.ba.solver.rig_problem import (
     BundleCamera,
@@ -24,7 +26,7 @@ from rigwake.ba.solver.rig_problem import (
 )
 from rigwake.ba.solver.robust_loss import Loss, robust
 from rigwake.ba.solver.schur import landmark_steps
-from rigwake.errors import UsageError
+from rigwake.errors import EstimationError, UsageError
 from rigwake.geometry.se3 import SE3
 
 OFFSETS = (0.015, -0.02, 0.005, -0.01)
@@ -182,6 +184,39 @@ def test_a_step_is_that_of_dense_least_squares(imu: bool) -> None:
     np.testing.assert_allclose(marks, expected_marks, atol=1e-4 * np.abs(expected_marks).max())
 
 
+def test_frames_on_a_state_and_between_states_give_the_dense_schur_complement() -> None:
+    """Without an IMU the reference camera's frames lie on states, the others' between two."""
+    wanted = Wanted(cameras=2, seconds=1.6, landmarks=20, imu=False, far=40.0, gnss_std=None)
+    problem = true_problem(wanted)
+    free = replace(problem.cameras[1], free=frozenset({"rig_from_cam", "time_offset"}), time_offset_s=0.03)
+    problem = replace(problem, cameras=(problem.cameras[0], free))
+    structure = structure_of(problem)
+    layout, linear = structure.layout, linearised(problem, structure, SolverOptions(loss="none"))
+    assert np.any(linear.poses.states[:, 0] != linear.poses.states[:, 1])
+    assert np.any(linear.poses.states[:, 0] == linear.poses.states[:, 1])
+    o, n = linear.observations, layout.n_columns
+    by_column = np.stack([linear.poses.moved_by(layout, unit) for unit in np.eye(n)], axis=-1)
+    J = o.by_frame @ by_column[o.frames]
+    dense = np.einsum("mia,mib->ab", J, J)
+    for start, stop in pairwise(o.landmark_starts):
+        marks = o.by_landmark[start:stop].reshape(-1, 3)
+        if len(marks):
+            coupling = J[start:stop].reshape(-1, n).T @ marks
+            dense -= coupling @ np.linalg.solve(marks.T @ marks, coupling.T)
+    equations, _ = equations_of(linear, structure, damping=0.0)
+    held = layout.n_state_columns
+    found = np.zeros((n, n))
+    for i in range(len(structure.shape.first)):
+        rows = structure.shape.rows(equations.states, i)
+        top, left = i * structure.shape.tile, structure.shape.first[i] * structure.shape.tile
+        found[top : top + len(rows), left : left + rows.shape[1]] = rows
+    found[held:, :held], found[held:, held:] = equations.border.T, equations.corner
+    found = np.tril(found) + np.tril(found, -1).T
+    scale = 1 / np.sqrt(np.maximum(np.diag(dense), 1e-12))
+    np.testing.assert_allclose(found * np.outer(scale, scale), dense * np.outer(scale, scale), atol=1e-6)
+    assert np.linalg.eigvalsh(found * np.outer(scale, scale))[0] > -1e-8
+
+
 def test_envelope_cholesky_is_dense_cholesky() -> None:
     rng = np.random.default_rng(4)
     n, unit = 90, 6
@@ -319,3 +354,16 @@ def test_states_alone_need_no_observations() -> None:
     problem = RigProblem(states, (camera,), nothing, Observations.empty())
     assert layout_of(problem).n_columns == 18
     assert solve(problem).report.final_cost == 0.0
+
+
+def test_a_negative_eigenvalue_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = free_cameras(true_problem(replace(POSES_ONLY, seconds=2.0, cameras=2)), "rig_from_cam")
+    honest = NormalEquations.factorise
+
+    def wrong(equations: NormalEquations) -> ReducedEquations:
+        reduced = honest(equations)
+        return replace(reduced, shared=reduced.shared - 0.9 * np.diag(np.diag(equations.corner)))
+
+    monkeypatch.setattr(NormalEquations, "factorise", wrong)
+    with pytest.raises(EstimationError, match="negative eigenvalue"):
+        covariance_of(problem)

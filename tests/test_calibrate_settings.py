@@ -1,5 +1,6 @@
 """What goes into a calibration: settings, priors, the selected part of a recording, stage files."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,15 +15,23 @@ from rigwake.ba.rig.initialisation import InitialRig
 from rigwake.ba.rig.rig_values import AdjustmentOptions
 from rigwake.ba.solver.rig_problem import PosePrior
 from rigwake.calibration import Calibration
+from rigwake.cli.console import write_json
 from rigwake.config import CalibrateConfig, load_config
 from rigwake.errors import InputError, UnobservableError, UsageError
 from rigwake.fingerprint import input_fingerprint
 from rigwake.geometry.se3 import SE3
+from rigwake.pipeline.camera_stage import (
+    CameraJob,
+    CameraOutcome,
+    load_outcome,
+    outcome_file,
+    process_camera,
+)
 from rigwake.pipeline.outputs import horizon_pixels
 from rigwake.pipeline.prior import RigPrior, load_prior
 from rigwake.pipeline.stage_files import StageLedger, stage_key
 from rigwake.pipeline.stream_selection import select
-from rigwake.recording import AttitudeStream
+from rigwake.recording import AttitudeStream, CameraStream
 from rigwake.simulation.tracks_only import SimulatedTracks
 
 
@@ -214,3 +223,18 @@ def test_horizon_pixels_look_at_right_angles_to_up(world: SimulatedTracks, up: l
     assert seen.any()
     assert valid.all()
     np.testing.assert_allclose(bearings @ up_cam, 0.0, atol=1e-6)
+
+
+def test_json_files_hold_no_nan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera of which nothing was placed has residuals that are no number: null in every file."""
+    outcome = CameraOutcome("front", None, counts={"odometry": {"inlier_rms_px": np.nan, "inliers": 0}})
+    monkeypatch.setattr("rigwake.pipeline.camera_stage._process", lambda job, progress: outcome)
+    stream = CameraStream("front", np.arange(2), None, 4, 4)
+    process_camera(CameraJob(stream, None, tmp_path, CalibrateConfig()), lambda words, part: None)
+    text = outcome_file(tmp_path, "front").read_text()
+    assert "NaN" not in text
+    loaded = load_outcome(tmp_path, "front").counts
+    assert loaded is not None
+    assert loaded["odometry"]["inlier_rms_px"] is None
+    write_json(tmp_path / "any.json", {"a": [np.inf, np.float64(np.nan), 1.0], "b": np.array([np.nan])})
+    assert json.loads((tmp_path / "any.json").read_text()) == {"a": [None, None, 1.0], "b": [None]}

@@ -45,6 +45,7 @@ USED = [
     ("calibrate {images} -o {here}/c3 --force --view", 3, "3.0 s of images"),
     ("inspect {images} --camera-file front={lens}", (0, 1, 2), ""),
     ("calibrate {images} -o {here}/c4 --camera-file front={lens} --repair", (2, 3), ""),
+    ("calibrate {images} -o {here}/c6 --horizon off --intrinsics fixed", 3, "3.0 s of images"),
     ("calibrate {images} -o {here}/c5 --no-repair", 3, "3.0 s of images"),
     ("odometry {images} -o {here}/o5 --camera front --no-repair", 1, ""),
     ("odometry {images} -o {here}/o6 --camera front --repair", 1, ""),

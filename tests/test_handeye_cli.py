@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from handeye_scenes import PORT, planar, standstill, wavy
-from rigwake.calibration import load_calibration
+from rigwake.calibration import CalibratedCamera, load_calibration
+from rigwake.calibration.rig_calibration import UnobservableDirection
 from rigwake.cli.main import main
 from rigwake.geometry.se3 import SE3
+from rigwake.handeye.handeye_result import HandeyeResult
 from rigwake.readers.open import open_recording
 from rigwake.writers import trajectory_writer
 
@@ -104,3 +106,27 @@ def test_exit_codes(tmp_path, run):
     assert run(still, other)[0] == 3
     assert run(still, other, "--noise", "loud")[0] == 2
     assert run(still, tmp_path / "missing.tum")[0] == 1
+
+
+def test_what_determines_nothing_ends_with_exit_code_3(tmp_path, run, monkeypatch):
+    """One axis of a rotation alone is no number: files hold null, and the exit code says so."""
+    one_axis = CalibratedCamera(
+        "port",
+        SE3.identity(),
+        np.eye(6),
+        unobservable=tuple(UnobservableDirection(axis, "open", "Turn.") for axis in np.eye(6)[1:]),
+    )
+    assert not one_axis.has_figures
+    assert replace(one_axis, unobservable=one_axis.unobservable[2:]).has_figures
+    there, empty = {"port": SE3.identity()}, {"port": np.empty((0, 2))}
+    nothing = HandeyeResult(
+        "rig", {"port": one_axis}, there, np.eye(6), empty, "increments", {}, 5, 0, 3, converged=True
+    )
+    monkeypatch.setattr("rigwake.handeye.joint_calibration.calibrate_handeye", lambda *_: nothing)
+    rig = write_tum(tmp_path / "rig.tum", wavy(TIMES))
+    code, _ = run(rig, rig, "--json", tmp_path / "out.json")
+    assert code == 3
+    assert (
+        json.loads((tmp_path / "out.json").read_text())["members"]["port"]["std"]["translation_m"]
+        == [None] * 3
+    )

@@ -16,6 +16,7 @@ from rigwake.geometry.se3 import SE3
 from rigwake.readers.open import open_recording
 from rigwake.readers.stamp_units import stamps_from_text
 from rigwake.readers.streams import time_order, unit_quaternions
+from rigwake.writers.folders import write_folder
 
 
 def test_euroc_holds_the_published_rig(real_recordings: Path) -> None:
@@ -233,3 +234,40 @@ def test_quaternions_that_are_none_become_nan() -> None:
         True,
         False,
     ]
+
+
+@pytest.mark.parametrize(
+    ("settings", "gyro"),
+    [
+        ("imu: {gyro_noise_density: 2e-4, accel_noise_density: 0.003}", 2e-4),
+        ("imu: {gyroscope_noise_density: 0.0002, accelerometer_noise_density: 3.0e-3, rate: 100}", 2e-4),
+        ("imu: {imu: {gyro_noise_density: 0.0002, accel_noise_density: 0.003}, imu_port: {}}", 2e-4),
+        ("imu: {imu_port: {gyro_noise_density: 0.0002}}", None),
+        ("cameras: {}", None),
+    ],
+)
+def test_the_imu_noise_of_rig_yaml_is_read(tmp_path: Path, settings: str, gyro: float | None) -> None:
+    (tmp_path / "imu.csv").write_text(
+        "timestamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z\n0,0,0,0,0,0,9.8\n10000000,0,0,0,0,0,9.8\n"
+    )
+    (tmp_path / "rig.yaml").write_text(settings + "\n")
+    recording = open_recording(tmp_path)
+    assert recording.imus["imu"].gyro_noise_density == gyro
+    assert recording.imus["imu"].accel_noise_density == (None if gyro is None else 0.003)
+    write_folder(recording, tmp_path / "copy")
+    assert open_recording(tmp_path / "copy").imus["imu"].gyro_noise_density == gyro
+
+
+def test_settings_that_nobody_reads_are_named(tmp_path: Path) -> None:
+    (tmp_path / "imu.csv").write_text(
+        "timestamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z\n0,0,0,0,0,0,9.8\n10000000,0,0,0,0,0,9.8\n"
+    )
+    (tmp_path / "rig.yaml").write_text("cameras: {}\nimu: {gyro_density: 1.0}\nnoise: {gyro: 1}\n")
+    messages = " ".join(finding.message for finding in open_recording(tmp_path).findings)
+    assert "gyro_density" in messages
+    assert "noise not read" in messages
+    (tmp_path / "rig.yaml").write_text("imu: {gyro_noise_density: -1.0}\n")
+    (tmp_path / "gnss.csv").write_text(
+        "timestamp_ns,latitude,longitude,altitude\n0,57,11,0\n1000000000,57,11,0\n"
+    )
+    assert "positive" in " ".join(finding.message for finding in open_recording(tmp_path).findings)

@@ -8,9 +8,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from rigwake.ba.rig.intrinsics_refinement import IntrinsicsChoice
 from rigwake.ba.rig.rig_values import AdjustmentOptions
 from rigwake.ba.rig.search_proposals import AssociationOptions
 from rigwake.errors import InputError, UsageError
+from rigwake.odometry.below_horizon import HorizonChoice
 from rigwake.odometry.odometry_options import OdometryOptions
 from rigwake.tracking.tracking_options import TrackingOptions
 from rigwake.yaml_input import parse_yaml, read_yaml_settings
@@ -37,6 +39,8 @@ class CalibrateConfig(BaseModel):
     jobs: processes (0: as many as there are cores). seed: of everything random.
     time_offsets: estimate the cameras' clocks. imu, gnss: whether to use them.
     sensor_checks: compare every sensor with the others; repair: correct units, leave out samples that cannot be right.
+    horizon: leave out what lies below the horizon (needs an IMU): on, off, or auto (where it is water).
+    intrinsics: fixed (as given), or refine (with the rig, about what was given).
     line_delay_s: read-out time per row of rolling shutters, by camera; estimate_line_delay: refine it.
     """
 
@@ -54,6 +58,8 @@ class CalibrateConfig(BaseModel):
     find_self_mask: bool = True
     sensor_checks: bool = True
     repair: bool = True
+    horizon: HorizonChoice = "auto"
+    intrinsics: IntrinsicsChoice = "refine"
     line_delay_s: dict[str, float] = Field(default_factory=dict)
     estimate_line_delay: bool = False
     imu_noise: ImuNoiseSettings = ImuNoiseSettings()

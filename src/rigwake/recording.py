@@ -55,7 +55,8 @@ class CameraStream:
 
     timestamps_ns: (N,) strictly increasing, camera clock, one per frame.
     model: intrinsics, if the recording or the user gave them. topic: topic or folder it came from.
-    frame_id: its optical frame in the recording's tf tree, if any.
+    frame_id: its optical frame in the recording's tf tree, if any. intrinsics_covariance: (P, P) of the model's
+    parameters, if a board calibrated them and its file says so.
     """
 
     name: str
@@ -66,6 +67,7 @@ class CameraStream:
     model: CameraModel | None = None
     topic: str = ""
     frame_id: str = ""
+    intrinsics_covariance: Array | None = None
 
     def __len__(self) -> int:
         return len(self.timestamps_ns)

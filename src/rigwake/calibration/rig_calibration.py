@@ -101,6 +101,13 @@ class CalibratedCamera:
         return bool(self.observable_axes.all())
 
     @property
+    def has_figures(self) -> bool:
+        """Whether anything of it stands in files and tables as a number: the whole rotation, or one offset. (A rotation
+        of which only one axis is determined has no number.)"""
+        observable = self.observable_axes
+        return bool(observable[:3].all() or observable[3:].any())
+
+    @property
     def covariance_rig_axes(self) -> Array:
         """(6, 6) covariance about and along the axes of the rig; NaN where unobservable."""
         if not np.isfinite(self.rig_from_cam.rotation).all():

@@ -12,9 +12,11 @@ from rigwake.cli.console import figures_table, next_step, out, print_title, prog
 from rigwake.cli.options import (
     AllowPartialOption,
     CameraFileOption,
+    HorizonOption,
     JsonOption,
     TopicOption,
     TopicsOption,
+    horizon_choice,
     require_there,
     require_writable,
 )
@@ -56,6 +58,11 @@ def command(
         bool,
         typer.Option("--repair/--no-repair", help="Correct units, leave out samples that cannot be right."),
     ] = True,
+    horizon: HorizonOption = "auto",
+    intrinsics: Annotated[
+        str | None,
+        typer.Option(help="refine them with the rig (default), or keep them fixed as given."),
+    ] = None,
     jobs: Annotated[int | None, typer.Option(help="Processes (default: one per core).")] = None,
     seed: Annotated[int | None, typer.Option(help="Random seed.")] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file of settings.")] = None,
@@ -95,6 +102,8 @@ def command(
         cameras=None if cameras is None else [name.strip() for name in cameras.split(",") if name.strip()],
         start_s=start,
         duration_s=duration,
+        intrinsics=intrinsics,
+        horizon=None if horizon == "auto" else horizon_choice(horizon),
         jobs=jobs,
         seed=seed,
         repair=None if repair else False,

@@ -131,8 +131,10 @@ def figures_table(headings: Sequence[str], words: int = 1) -> Table:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write strict JSON (no NaN) atomically; '-' prints it."""
-    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    """Write strict JSON atomically (NaN and infinities become null); '-' prints it."""
+    from rigwake.calibration.yaml_file import plain  # here: it takes longer to load than most verbs' help
+
+    text = json.dumps(plain(content), indent=2, allow_nan=False) + "\n"
     if str(path) == "-":
         print(text, end="")
     else:

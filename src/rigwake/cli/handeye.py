@@ -12,6 +12,7 @@ from rich.markup import escape
 
 from rigwake.cli.console import err, figures_table, next_step, out, print_title, write_json
 from rigwake.cli.options import JsonOption, completed_from, require, require_there, require_writable
+from rigwake.errors import UnobservableError
 
 if TYPE_CHECKING:
     from rigwake.calibration import CalibratedCamera
@@ -114,9 +115,12 @@ def command(
         save_calibration(result.calibration(provenance), output)
     if json_file is not None:
         write_json(json_file, result_to_json(result) | {"sensor_checks": checks_to_list(checks)})
-        if str(json_file) == "-":
-            return
-    _print(result)
+    if str(json_file) != "-":
+        _print(result)
+    if not any(camera.has_figures for camera in result.members.values()):
+        raise _nothing_determined(result)
+    if str(json_file) == "-":
+        return
     for check in checks:
         agreement = f"{100 * check.statistic:.1f} % of its motion does not agree"
         out.print(
@@ -137,6 +141,15 @@ def _words_of_options(method: str, noise: str, time_offset: bool, scale: bool) -
     words = [] if method == "ml" else ["--method", method]
     words += [] if noise == "auto" else ["--noise", noise]
     return words + ([] if time_offset else ["--no-time-offset"]) + (["--scale"] if scale else [])
+
+
+def _nothing_determined(result: HandeyeResult) -> UnobservableError:
+    remedies = [d.remedy for camera in result.members.values() for d in camera.unobservable if d.remedy]
+    return UnobservableError(
+        f"The motion determined nothing of {', '.join(result.members)}.",
+        consequence="Files and tables hold no number.",
+        remedy=remedies[0] if remedies else "Turn about two axes while moving.",
+    )
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import os
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
@@ -38,6 +38,9 @@ LENS_MODELS = ("pinhole", "rational", "kb4", "kb23", "mei", "scaramuzza", "eucm"
 PRESETS = tuple(
     sorted(p.stem for p in (Path(__file__).parent.parent / "simulation" / "scenarios").glob("*.yaml"))
 )
+
+if TYPE_CHECKING:
+    from rigwake.odometry.below_horizon import HorizonChoice
 
 TopicOption = Annotated[
     list[str] | None,
@@ -77,6 +80,23 @@ def topic_words(topic: Sequence[str] | None, topics: Path | None) -> list[str]:
     """The same choice of topics again, for a command that is named as the next step."""
     words = [word for assignment in topic or () for word in ("--topic", assignment)]
     return words + (["--topics", str(topics)] if topics is not None else [])
+
+
+HorizonOption = Annotated[
+    str,
+    typer.Option(
+        "--horizon",
+        help="Leave out what lies below the horizon (with an IMU): on, off, or auto: where it is water.",
+    ),
+]
+
+
+def horizon_choice(value: str) -> HorizonChoice:
+    """`auto`, `on` or `off`; UsageError else."""
+    from rigwake.odometry.below_horizon import HorizonChoice
+
+    require("--horizon", value, get_args(HorizonChoice))
+    return cast("HorizonChoice", value)
 
 
 def require(option: str, value: str, known: Sequence[str]) -> None:

@@ -19,9 +19,12 @@ from rigwake.handeye.motions import Mounting
 from rigwake.handeye.noise_selection import without_drift
 from rigwake.handeye.observability import covariance, unobservable_directions
 from rigwake.handeye.one_body import require_one_body
+from rigwake.handeye.resample import longest_segments
 from rigwake.handeye.thesis_handeye import thesis_handeye
 from rigwake.sync import MIN_OVERLAP, estimate_time_offset
 from rigwake.trajectory import Trajectory
+
+_MOST_SEGMENTS = 60  # of a member: unknowns grow with them, and time with their square
 
 
 def calibrate_handeye(
@@ -30,12 +33,14 @@ def calibrate_handeye(
     """Where every member sits on the reference, from nothing but their trajectories.
 
     The trajectories may have any origin, rate and clock; members may be up to scale. All members are solved
-    together, so that loops through them close exactly.
+    together, so that loops through them close exactly. Of a member in very many segments the longest are used.
 
     Raises UsageError (names, a reference up to scale), UnobservableError (nothing of a member is determined,
     or its clock cannot be aligned), EstimationError (no convergence).
     """
     options = options or HandeyeOptions()
+    shortened = [longest_segments(member, _MOST_SEGMENTS) for member in members]
+    members = [member for member, _ in shortened]
     offsets = [_time_offset(reference, member) if options.time_offset else None for member in members]
     problem = pose_problem(reference, members, options, [offset is not None for offset in offsets])
     start = initial_mountings(problem, [offset or 0.0 for offset in offsets])
@@ -52,7 +57,7 @@ def calibrate_handeye(
         )
     for member, mounting in zip(members, estimate.mountings, strict=True):
         require_one_body(reference, member, mounting.ref_from_member, mounting.time_offset_s)
-    return _result(problem, estimate, options)
+    return _result(problem, estimate, options, [left_out for _, left_out in shortened])
 
 
 def _time_offset(reference: Trajectory, member: Trajectory) -> float | None:
@@ -68,7 +73,9 @@ def _time_offset(reference: Trajectory, member: Trajectory) -> float | None:
         return None
 
 
-def _result(problem: HandeyeProblem, estimate: HandeyeEstimate, options: HandeyeOptions) -> HandeyeResult:
+def _result(
+    problem: HandeyeProblem, estimate: HandeyeEstimate, options: HandeyeOptions, left_out: Sequence[int]
+) -> HandeyeResult:
     total = covariance(problem, estimate)
     reference = problem.reference.trajectory
     rotations = problem.reference.increments[:, :3]
@@ -98,7 +105,7 @@ def _result(problem: HandeyeProblem, estimate: HandeyeEstimate, options: Handeye
             time_offset_std_s=time_offset_std if time_offset_known else None,
             scale=float(scales[name][0, 0]) if single else None,
             scale_std=float(scales[name][0, 1]) if single else None,
-            statistics={"steps": int(valid.sum())},
+            statistics={"steps": int(valid.sum()), "poses_left_out": left_out[m]},
         )
     return HandeyeResult(
         reference.name,

@@ -18,6 +18,7 @@ from rigwake.handeye.likelihood import HandeyeEstimate, information_criterion, m
 from rigwake.handeye.motions import residuals, steps_between
 
 _LONGEST_WITHOUT_DRIFT = 20_000  # steps
+_MOST_PIECES = 60  # segments of all members: each has a world of its own in the model of the poses
 _STRIDES = 8  # that make up the recording, where its variance over a long stride is taken
 _SATURATED = 0.5  # of the variance that independent errors of the increments would have reached
 _STATIONARY = 1.000  # 5 % limit of the statistic for three series (Nyblom and Harvey 2000, table 1)
@@ -31,7 +32,10 @@ def without_drift(
     It does if it predicts better (BIC), or if its residuals, however long their memory, do not wander (see
     `wandering`).
     """
-    if len(estimate.valid) > _LONGEST_WITHOUT_DRIFT or not _saturates(problem, estimate):
+    pieces = sum(curve.segment_count for curve in problem.members)
+    if len(estimate.valid) > _LONGEST_WITHOUT_DRIFT or pieces > _MOST_PIECES:
+        return problem, estimate
+    if not _saturates(problem, estimate):
         return problem, estimate
     as_poses, to_beat = with_poses(problem, options), information_criterion(problem, estimate)
 

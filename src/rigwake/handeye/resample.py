@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -121,3 +121,28 @@ def _node_twists(increments: Array, steps: Array) -> Array:
     before, after = steps[:-1, None], steps[1:, None]
     twists[1:-1] = (speed[:-1] * after + speed[1:] * before) / (before + after)
     return twists
+
+
+def longest_segments(trajectory: Trajectory, most: int) -> tuple[Trajectory, int]:
+    """The trajectory with its `most` longest segments, numbered from 0, and how many poses of others were left out.
+
+    Every segment brings unknowns of its own (scale, world); of those that last for a few poses hardly more is left.
+    """
+    ids = trajectory.segment_ids
+    assert ids is not None
+    counts = np.bincount(ids)
+    present = np.flatnonzero(counts)
+    if len(present) <= most:
+        return trajectory, 0
+    kept = np.sort(present[np.argsort(-counts[present], kind="stable")[:most]])
+    rows = np.flatnonzero(np.isin(ids, kept))
+    covariances = None if trajectory.covariances is None else trajectory.covariances[rows]
+    # covariances of increments stay true: within a segment nothing is thinned
+    shorter = replace(
+        trajectory,
+        timestamps_ns=trajectory.timestamps_ns[rows],
+        world_from_body=trajectory.world_from_body[rows],
+        covariances=covariances,
+        segment_ids=np.searchsorted(kept, ids[rows]),
+    )
+    return shorter, len(trajectory) - len(rows)

@@ -10,6 +10,7 @@ from typing import Literal
 from rigwake._types import Array
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import EstimationError, UnobservableError, UsageError
+from rigwake.odometry.below_horizon import HorizonChoice
 from rigwake.odometry.bridged import bridged
 from rigwake.odometry.loop_closure import closed_path, find_loops, joined_tracks
 from rigwake.odometry.measure import Progress, measure_camera
@@ -35,7 +36,7 @@ class CameraOdometryOptions:
     """What to do for one camera.
 
     method: `adjusted` (keyframes, bundle adjustment, smoother) or `seed` (the frame-to-frame baseline).
-    hull: look for the own boat in view. horizon: leave out what lies below the horizon (needs an IMU).
+    hull: look for the own boat in view. horizon: whether what lies below the horizon is left out (needs an IMU).
     mask_file: picture of the camera's size, white where it may be used.
     loops: recognise places seen before and join their tracks; without it this is done only where the odometry broke.
     refine_lens: without IMU and GNSS, refine distortion and principal point where the images contradict them.
@@ -46,7 +47,7 @@ class CameraOdometryOptions:
     odometry: OdometryOptions = field(default_factory=OdometryOptions)
     seed: ThesisOptions = field(default_factory=ThesisOptions)
     hull: bool = True
-    horizon: bool = True
+    horizon: HorizonChoice = "auto"
     mask_file: Path | None = None
     loops: bool = False
     refine_lens: bool = True

@@ -9,11 +9,14 @@ from rigwake._types import Array, Stamps
 from rigwake.odometry.gyro import GyroAlignment, integrate_gyro
 from rigwake.recording import ImuStream
 
+_LEAST_GRAVITY = (
+    5.0  # m/s^2 in the mean: with less, gravity was taken out of the recording, or it is in units of g
+)
 _WINDOW_S = 20.0  # a turn at 2 m/s moves the mean over so long by about a degree at the most
 
 
 def up_directions(imu: ImuStream, gyro_bias: Array) -> Array:
-    """(N, 3) unit vectors against gravity in IMU axes at its samples, good to about a degree.
+    """(N, 3) unit vectors against gravity in IMU axes at its samples, good to about a degree; NaN without gravity.
 
     The specific force, turned into the axes of the start by the integrated gyro, is averaged over a moving
     window in which accelerations of the vessel cancel: its velocity changes by a few m/s at most.
@@ -23,7 +26,9 @@ def up_directions(imu: ImuStream, gyro_bias: Array) -> Array:
     rate_hz = 1e9 / float(np.median(np.diff(imu.timestamps_ns)))
     mean = uniform_filter1d(force_start, max(int(_WINDOW_S * rate_hz), 1), axis=0, mode="nearest")
     up = np.einsum("nji,nj->ni", turned, mean)
-    return np.asarray(up / np.linalg.norm(up, axis=1, keepdims=True))
+    size = np.linalg.norm(up, axis=1, keepdims=True)
+    known = size > _LEAST_GRAVITY
+    return np.asarray(np.where(known, up / np.where(known, size, 1.0), np.nan))
 
 
 def up_in_camera(imu: ImuStream, alignment: GyroAlignment, timestamps_ns: Stamps) -> Array:

@@ -8,8 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from rigwake._types import Array
 from rigwake.errors import EstimationError, UnobservableError
+from rigwake.odometry.below_horizon import HorizonChoice, look_below_horizon
 from rigwake.odometry.gravity_alignment import up_in_camera
 from rigwake.odometry.gyro import GyroAlignment, align_gyro, camera_rotations
 from rigwake.recording import CameraStream, ImuStream
@@ -44,16 +47,16 @@ def measure_camera(
     progress: Progress,
     *,
     hull: bool = True,
-    horizon: bool = True,
+    horizon: HorizonChoice = "auto",
     mask_file: Path | None = None,
     turns: Trajectory | None = None,
 ) -> CameraMeasurement:
     """Mask, gyro and tracks of a camera; the gyro tells where the horizon is, and below it nothing is tracked.
 
-    hull: look for the own boat in view. horizon: leave out what lies below it. mask_file: a picture of the camera's
-    size, white where it may be used. turns: what `visual_rotations` finds, if that is known.
-    A hull that is not found and a gyro that does not fit are noted and done
-    without. Raises EstimationError where nothing can be tracked.
+    hull: look for the own boat in view. horizon: leave out what lies below it (auto: where it is water). mask_file: a
+    picture of the camera's size, white where it may be used. turns: what `visual_rotations` finds, if that is known.
+    A hull that is not found and a gyro that does not fit are noted and done without. Raises EstimationError where
+    nothing can be tracked.
     """
     notes: list[str] = []
     marks = [time.perf_counter()]
@@ -65,8 +68,14 @@ def measure_camera(
     notes += gyro_notes
     marks.append(time.perf_counter())
     up_cam = None
-    if horizon and gyro is not None and imu is not None:
+    if horizon != "off" and gyro is not None and imu is not None:
         up_cam = up_in_camera(imu, gyro, stream.timestamps_ns)
+        if not np.isfinite(up_cam).any():
+            notes.append("the accelerometer shows no gravity: where the horizon is cannot be told")
+        elif horizon == "auto":
+            below = look_below_horizon(stream, up_cam, mask.usable)
+            notes.append(below.words)
+            up_cam = None if below.is_rigid else up_cam
     total = max(len(stream), 1)
     tracks = track_camera(
         stream, tracking, mask, up_cam=up_cam, progress=lambda done: progress("tracking", done, total)

@@ -18,6 +18,7 @@ from rigwake.odometry.imu_alignment import InertialAlignment, align_inertial
 from rigwake.recording import GnssStream, ImuStream
 from rigwake.trajectory import Trajectory
 
+_FEW = 3  # segments that are worth a line each
 _UP = np.array([0.0, 0.0, 1.0])
 _ALIGNED_STD = np.deg2rad(1.0)  # floor of what is assumed for a first value
 
@@ -140,17 +141,19 @@ def _all_by_gnss(
 ) -> tuple[list[Trajectory], Array]:
     """Every segment placed by its own fixes, with the antenna where the longest segment found it."""
     placed, used, gated = [], np.zeros(len(gnss.timestamps_ns), dtype=bool), 0
+    left_out: list[tuple[float, str]] = []
     for number, piece in enumerate(pieces):
         alignment = found
         if number != main:
             try:
                 alignment = align_gnss(piece, gnss, time_offset_s=offset_s, antenna_cam=found.antenna_cam)
             except UnobservableError as error:
-                notes.append(f"a segment of {piece.duration_s:.1f} s was left out: {error.cause}")
+                left_out.append((piece.duration_s, error.cause))
                 continue
         placed.append(_metric(piece, alignment.enu_from_visual))
         used |= alignment.used
         gated += alignment.gated
+    notes += _left_out_notes(left_out)
     if gated:
         notes.append(f"{gated} GNSS fixes were refused by the chi-square gate")
     return placed, used
@@ -165,15 +168,22 @@ def _all_by_imu(
     notes: list[str],
 ) -> list[Trajectory]:
     """The longest segment, level and in metres; without GNSS nothing says where the others are."""
-    for number, piece in enumerate(pieces):
-        if number != main:
-            notes.append(
-                f"a segment of {piece.duration_s:.1f} s was left out: without GNSS its place is unknown"
-            )
+    others = [piece for number, piece in enumerate(pieces) if number != main]
+    notes += _left_out_notes([(p.duration_s, "without GNSS its place is unknown") for p in others])
     down = inertial.gravity_visual / np.linalg.norm(inertial.gravity_visual)
     level_from_visual = _rotation_onto(-down, _UP)
     origin = -inertial.scale * level_from_visual @ pieces[main].world_from_body.translation[0]
     return [_metric(pieces[main], Alignment(SE3(level_from_visual, origin), inertial.scale))]
+
+
+def _left_out_notes(left_out: list[tuple[float, str]]) -> list[str]:
+    """Which segments (seconds, cause) were left out: each by itself, or many in one line."""
+    if len(left_out) <= _FEW:
+        return [f"a segment of {seconds:.1f} s was left out: {cause}" for seconds, cause in left_out]
+    total, (longest, cause) = sum(seconds for seconds, _ in left_out), max(left_out)
+    return [
+        f"{len(left_out)} segments of {total:.1f} s together were left out; the longest, of {longest:.1f} s: {cause}"
+    ]
 
 
 def _rotation_onto(a: Array, b: Array) -> Array:

@@ -48,6 +48,7 @@ from rigwake.report import build_report, load_report_content
 from rigwake.tracks import load_tracks
 from rigwake.trajectory import Trajectory
 
+_MOVED_PX = 0.5  # worth a word
 _NOISY_IMU = 2.0  # times its assumed value: worth a word
 _LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "poselib", "rosbags")
 
@@ -196,7 +197,7 @@ def _conclude(
         if name.startswith("camera ")
     }
     notes = (*selection.notes, *(f"{o.name}: {n}" for o in outcomes for n in o.notes), *first.notes)
-    notes += _noisy_imu(rig.calibration)
+    notes += _noisy_imu(rig.calibration) + _moved_intrinsics(rig.calibration)
     calibration = replace(
         rig.calibration,
         checks={
@@ -310,6 +311,25 @@ def _noisy_imu(calibration: Calibration) -> tuple[str, ...]:
         for sensor, factor in calibration.checks.get("imu_noise_factors", {}).items()
         if factor > _NOISY_IMU
     )
+
+
+def _moved_intrinsics(calibration: Calibration) -> tuple[str, ...]:
+    """Words about intrinsics that were refined by more than a little, and what the motion did not tell of them."""
+    words = []
+    for name, camera in calibration.cameras.items():
+        found = camera.statistics.get("intrinsics")
+        if not found:
+            continue
+        if (found["moved_rms_px"] or 0.0) > _MOVED_PX:
+            words.append(
+                f"{name}: the intrinsics given were refined, by {found['moved_rms_px']:.1f} px (RMS)"
+            )
+        if found["not_determined"]:
+            names = ", ".join(found["not_determined"])
+            words.append(
+                f"{name}: intrinsics that the motion does not tell one by one: {names}; {found['remedy']}"
+            )
+    return tuple(words)
 
 
 def _provenance(

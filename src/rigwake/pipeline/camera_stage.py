@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from rigwake.atomic import write_text_atomic
+from rigwake.calibration.yaml_file import plain
 from rigwake.config import CalibrateConfig
 from rigwake.errors import HostError, InputError, RigwakeError
 from rigwake.odometry.measure import measure_camera
@@ -97,8 +100,15 @@ def process_camera(job: CameraJob, report_stage: StageProgress) -> CameraOutcome
         outcome = CameraOutcome(name, str(error), unobservable=error.exit_code == 3)
         if job.imu is not None and job.config.sensor_checks:
             outcome = _once_more(job, report_stage, outcome)
+    except (ArithmeticError, IndexError, ValueError, np.linalg.LinAlgError) as error:
+        # a fault of the program on this camera's data: the others are calibrated all the same
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        what = f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
+        outcome = CameraOutcome(name, f"{name}: a fault of the program, please report it: {what}")
     outcome = replace(outcome, seconds=time.perf_counter() - started)
-    write_text_atomic(outcome_file(job.out, name), json.dumps(asdict(outcome), indent=1) + "\n")
+    write_text_atomic(
+        outcome_file(job.out, name), json.dumps(plain(asdict(outcome)), indent=1, allow_nan=False) + "\n"
+    )
     return outcome
 
 
@@ -123,7 +133,7 @@ def _process(job: CameraJob, report_stage: StageProgress, *, horizon: bool = Tru
         config.tracking,
         progress,
         hull=config.find_self_mask,
-        horizon=horizon,
+        horizon=config.horizon if horizon else "off",
         turns=job.turns,
     )
     measured.mask.save(job.out / "masks", stream.name)

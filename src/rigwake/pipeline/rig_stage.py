@@ -5,12 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from rigwake.ba.rig.assemble_problem import assemble_problem
 from rigwake.ba.rig.association_rounds import CrossCameraMatches, adjust_with_association
 from rigwake.ba.rig.imu_noise import imu_noise_factors
 from rigwake.ba.rig.initialisation import InitialRig, initial_rig
-from rigwake.ba.rig.outlier_rounds import adjust
+from rigwake.ba.rig.intrinsics_refinement import (
+    FIRMLY,
+    JUDGED,
+    holding,
+    intrinsics_statistics,
+    kept_directions,
+    prior_spreads_of,
+    priors_of,
+    with_free_intrinsics,
+    with_intrinsics_priors_of,
+)
+from rigwake.ba.rig.outlier_rounds import SETTLED, adjust
 from rigwake.ba.rig.rig_values import AdjustedRig, RigMeasurements
 from rigwake.ba.rig.rig_verdicts import ReferenceFrame, calibrated_cameras
 from rigwake.ba.rig.split_checks import (
@@ -20,9 +34,11 @@ from rigwake.ba.rig.split_checks import (
     split_half_summary,
 )
 from rigwake.ba.solver.covariance import covariance_of
+from rigwake.ba.solver.levenberg_marquardt import solve
+from rigwake.ba.solver.rig_problem import RigProblem, VectorPrior
 from rigwake.calibration import Calibration
 from rigwake.config import CalibrateConfig
-from rigwake.errors import InputError, UnobservableError
+from rigwake.errors import EstimationError, InputError, UnobservableError
 from rigwake.geometry.se3 import SE3
 from rigwake.pipeline.prior import RigPrior
 from rigwake.pipeline.stream_selection import Selection
@@ -32,6 +48,7 @@ from rigwake.recording import Recording, static_transform
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
+_MISFIT_PX, _MISFIT_FACTOR = 3.0, 8.0  # residuals beyond both are no noise
 StageProgress = Callable[[str, float], None]
 """Told what is being done and which fraction of it is done."""
 
@@ -115,19 +132,49 @@ def _adjust(
 ) -> tuple[AdjustedRig, CrossCameraMatches]:
     """The rig bundle adjustment: alone first, then with landmarks associated across cameras and times."""
     assembled = assemble_problem(measurements, first.start, config.adjustment)
-    assembled = replace(assembled, problem=prior.constrained(assembled.problem))
+    believed = _with_intrinsics(prior.constrained(assembled.problem), selection, config)
+    assembled = replace(assembled, problem=believed)
     progress(f"adjusting {len(assembled.problem.observations)} observations", 0.0)
     adjusted = adjust(assembled, config.adjustment, final=not config.adjustment.cross_camera)
-    if not config.adjustment.cross_camera:
-        return adjusted, CrossCameraMatches.nothing()
-    return adjust_with_association(
-        adjusted,
-        selection.cameras,
-        masks,
-        config.adjustment,
-        config.association,
-        lambda words: progress(words, 0.5),
-    )
+    matches = CrossCameraMatches.nothing()
+    if config.adjustment.cross_camera:
+        adjusted, matches = adjust_with_association(
+            adjusted,
+            selection.cameras,
+            masks,
+            config.adjustment,
+            config.association,
+            lambda words: progress(words, 0.5),
+        )
+    return _with_intrinsics_kept(adjusted, priors_of(believed)), matches
+
+
+def _with_intrinsics_kept(adjusted: AdjustedRig, believed: Mapping[str, VectorPrior]) -> AdjustedRig:
+    """The rig solved once more, with those intrinsics as believed that the motion does not tell or does not contradict.
+
+    In the covariance the former count with what was believed of them, the latter as if they had been free.
+    """
+    if not believed:
+        return adjusted
+    problem = adjusted.solution.problem
+    kept = kept_directions(problem, covariance_of(problem, clustered=True), believed)
+    every = {name: np.concatenate([k.untold, k.agreeing], axis=1) for name, k in kept.items()}
+    solution = solve(holding(problem, every, FIRMLY), SETTLED)
+    judged = holding(problem, {name: k.untold for name, k in kept.items()}, JUDGED)
+    solution = replace(solution, problem=with_intrinsics_priors_of(solution.problem, judged))
+    return replace(adjusted, solution=solution, intrinsics_priors=believed)
+
+
+def _with_intrinsics(problem: RigProblem, selection: Selection, config: CalibrateConfig) -> RigProblem:
+    """The problem with intrinsics free, about what is believed of them; as it is where they are to be trusted."""
+    if config.intrinsics == "fixed":
+        return problem
+    covariances = {
+        name: stream.intrinsics_covariance
+        for name, stream in selection.cameras.items()
+        if stream.intrinsics_covariance is not None
+    }
+    return with_free_intrinsics(problem, covariances)
 
 
 def _conclude(
@@ -140,14 +187,21 @@ def _conclude(
 ) -> Calibration:
     """Covariance, verdicts and checks."""
     solution = adjusted.solution
-    covariance = covariance_of(solution.problem, clustered=True)
+    believed = adjusted.intrinsics_priors
+    covariance = covariance_of(
+        solution.problem, clustered=True, prior_spreads=prior_spreads_of(solution.problem, believed)
+    )
     statistics = residual_statistics(solution)
     for name, numbers in statistics.items():
         numbers |= {"noise_factor": adjusted.noise_factors[name], "dropped": adjusted.dropped[name]}
+    _refuse_misfits(statistics)
+    given = {name: stream.model for name, stream in selection.cameras.items() if stream.model is not None}
+    for name, numbers in intrinsics_statistics(solution.problem, covariance, given, believed).items():
+        statistics[name]["intrinsics"] = numbers
     topics = {name: stream.topic for name, stream in selection.cameras.items()}
     calibration = calibrated_cameras(solution, covariance, reference, statistics, topics)
     others = [camera for name, camera in calibration.cameras.items() if name != reference.name]
-    if not any(camera.observable_axes.any() for camera in others):
+    if not any(camera.has_figures for camera in others):
         raise UnobservableError(
             "The motion determined nothing of any camera.", remedy=others[0].unobservable[0].remedy
         )
@@ -159,6 +213,18 @@ def _conclude(
         converged=solution.report.converged,
         imu_noise_factors=imu_noise_factors(selection.imu, solution.problem.imu),
     )
+
+
+def _refuse_misfits(statistics: Mapping[str, Mapping[str, Any]]) -> None:
+    """Residuals of several pixels, many times what was predicted, are no noise: the solution is wrong."""
+    for name, numbers in statistics.items():
+        rms_px, factor = numbers["rms_px"], numbers["noise_factor"]
+        if rms_px is not None and rms_px > _MISFIT_PX and factor > _MISFIT_FACTOR:
+            raise EstimationError(
+                f"{name}: the rig leaves residuals of {rms_px:.1f} px, {factor:.0f} times what the tracks predict.",
+                consequence="No one rigid rig with these lenses explains what the cameras saw.",
+                remedy="Check the intrinsics (model, field of view, image size), the cameras' names, and the clocks.",
+            )
 
 
 def reference_frame(

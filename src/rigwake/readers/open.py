@@ -58,12 +58,11 @@ def open_recording(path: Path | str, topics: TopicMap | None = None) -> Recordin
     recording = _read(path, topics)
     try:
         description = description_beside(euroc_root(path) or path if path.is_dir() else path)
+        if description is not None:
+            named = recording if topics.roles else renamed(recording, description)
+            recording = with_description(named, description)
     except InputError as error:
         recording = replace(recording, findings=(*recording.findings, Finding("warning", "", error.cause)))
-        description = None
-    if description is not None:
-        named = recording if topics.roles else renamed(recording, description)
-        recording = with_description(named, description)
     return longest_stretch(with_chosen_lenses(recording, topics.lenses))
 
 

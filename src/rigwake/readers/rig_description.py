@@ -19,8 +19,9 @@ from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import InputError
 from rigwake.geometry.geodesy import enu_from_lla, lla_from_enu
 from rigwake.geometry.se3 import SE3
+from rigwake.readers.imu_noise_settings import with_noise_settings
 from rigwake.readers.lens_choice import with_lenses
-from rigwake.readers.printable import is_plain_name
+from rigwake.readers.printable import is_plain_name, printable
 from rigwake.readers.rig_file import rig_from_mapping
 from rigwake.recording import (
     AttitudeStream,
@@ -39,6 +40,8 @@ RIG_FILE = "rig.yaml"
 MAX_TEXT_BYTES = 2**22
 
 IMU_NOISE = ("gyro_noise_density", "accel_noise_density", "gyro_bias_walk", "accel_bias_walk")
+_KEYS = {"reference", "cameras", "antenna_rig_m", "rig_from_imu", "imu", "static_transforms"}
+_KEYS |= {"imus", "gnss", "attitudes", "poses", "truth"}
 _ROLES = {
     "camera": "cameras",
     "imu": "imus",
@@ -91,6 +94,14 @@ def description_of(content: Any, where: str) -> RigDescription:
     }
     transforms, findings = plain_to_transforms(content.get("static_transforms"))
     imus, gnss, poses = described["imus"], described["gnss"], described["poses"]
+    settings = content.get("imu")  # of every IMU, or by name
+    if isinstance(settings, Mapping):
+        flat = {key: value for key, value in settings.items() if not isinstance(value, Mapping)}
+        imus = {**({"": flat} if flat else {}), **_entries(settings), **imus}
+    unread = [printable(str(key)) for key in content if key not in _KEYS]
+    if unread:
+        words = f"{RIG_FILE}: {', '.join(unread)} not read; known are {', '.join(sorted(_KEYS))}."
+        findings = (*findings, Finding("warning", RIG_FILE, words))
     return RigDescription(names, lenses, rig, imus, gnss, poses, transforms, findings)
 
 
@@ -120,9 +131,14 @@ def with_description(recording: Recording, description: RigDescription) -> Recor
     """The recording with the lenses, noise, origins and the rig that its description tells."""
     lenses = {name: lens for name, lens in description.lenses.items() if name in recording.cameras}
     completed = with_lenses(recording, lenses, RIG_FILE)
+    described = {
+        name: with_noise_settings(imu, description.imus.get(name, description.imus.get("", {})), RIG_FILE)
+        for name, imu in completed.imus.items()
+    }
+    strange = tuple(finding for _, findings in described.values() for finding in findings)
     return replace(
         completed,
-        imus={n: _with_noise(imu, description.imus.get(n, {})) for n, imu in completed.imus.items()},
+        imus={n: imu for n, (imu, _) in described.items()},
         gnss={n: _with_origin(gnss, description.gnss.get(n, {})) for n, gnss in completed.gnss.items()},
         poses={
             name: replace(poses, is_metric=bool(description.poses.get(name, {}).get("is_metric", True)))
@@ -132,7 +148,7 @@ def with_description(recording: Recording, description: RigDescription) -> Recor
         },
         static_transforms={**description.transforms, **completed.static_transforms},
         true_rig=description.rig or completed.true_rig,
-        findings=(*completed.findings, *description.findings),
+        findings=(*completed.findings, *description.findings, *strange),
     )
 
 
@@ -165,21 +181,6 @@ def _names(description: RigDescription, role: str, sensors: Iterable[_Sensor]) -
         name = description.name_of(role, sensor.topic or sensor.name, sensor.name)
         by_name[name if name not in by_name else sensor.name] = sensor
     return by_name
-
-
-def _with_noise(imu: ImuStream, entry: Mapping[str, Any]) -> ImuStream:
-    gyro, accel, gyro_walk, accel_walk = (_density(entry.get(key), getattr(imu, key)) for key in IMU_NOISE)
-    return replace(
-        imu,
-        gyro_noise_density=gyro,
-        accel_noise_density=accel,
-        gyro_bias_walk=gyro_walk,
-        accel_bias_walk=accel_walk,
-    )
-
-
-def _density(value: Any, otherwise: float | None) -> float | None:
-    return float(value) if isinstance(value, int | float) and 0 <= value < 1e6 else otherwise
 
 
 def _with_origin(gnss: GnssStream, entry: Mapping[str, Any]) -> GnssStream:

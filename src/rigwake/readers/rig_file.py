@@ -15,6 +15,9 @@ from rigwake.geometry.se3 import SE3
 from rigwake.rig import Rig, RigCamera
 from rigwake.yaml_input import read_yaml_settings
 
+# what a file may describe without any camera
+_WITHOUT_CAMERAS = {"imu", "imus", "gnss", "attitudes", "poses", "truth", "static_transforms"}
+
 
 def rigid_transform(matrix: Any, where: str) -> SE3:
     """A transform from 16 (or 12) numbers, checked to be rigid and made exactly so. InputError otherwise."""
@@ -32,7 +35,8 @@ def read_rig_file(path: Path) -> tuple[dict[str, CameraModel], Rig | None]:
     """Lenses by camera name, and the rig if the file says where every camera sits.
 
     Keys: `reference`, `cameras.NAME.camera` (a lens), `cameras.NAME.rig_from_cam` (`quat_wxyz`,
-    `translation_m`), `cameras.NAME.time_offset_s`, `antenna_rig_m`, `rig_from_imu`. Raises InputError.
+    `translation_m`), `cameras.NAME.time_offset_s`, `antenna_rig_m`, `rig_from_imu`; `imu` is for `imu_noise_settings`.
+    Raises InputError.
     """
     content = read_yaml_settings(path)
     return rig_from_mapping(content, str(path))
@@ -40,6 +44,8 @@ def read_rig_file(path: Path) -> tuple[dict[str, CameraModel], Rig | None]:
 
 def rig_from_mapping(content: Mapping[str, Any], path: str) -> tuple[dict[str, CameraModel], Rig | None]:
     """The same from plain values; path names them in errors."""
+    if not content.get("cameras") and content.keys() & _WITHOUT_CAMERAS:
+        return {}, None
     try:
         described = {str(name): dict(entry or {}) for name, entry in dict(content["cameras"]).items()}
         lenses = {n: e if "params" in e else e.get("camera") for n, e in described.items()}

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
-from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import InputError, UsageError
-from rigwake.readers.lens_choice import lenses_from_options
+from rigwake.readers.lens_choice import ChosenLens, lenses_from_options
 from rigwake.readers.printable import is_plain_name, plain_name, printable
 from rigwake.yaml_input import read_yaml
 
@@ -39,7 +38,7 @@ class TopicMap:
     """
 
     roles: Mapping[str, Mapping[str, str]] = field(default_factory=lambda: MappingProxyType({}))
-    lenses: Mapping[str, CameraModel] = field(default_factory=lambda: MappingProxyType({}))
+    lenses: Mapping[str, ChosenLens] = field(default_factory=lambda: MappingProxyType({}))
 
     def __post_init__(self) -> None:
         for names in self.roles.values():

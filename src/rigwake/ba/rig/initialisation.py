@@ -81,7 +81,12 @@ def initial_rig(
         antenna_rig=np.zeros(3) if lead.antenna_rig is None else lead.antenna_rig,
     )
     handeye = Calibration(reference_camera, {}) if result is None else result.calibration()
-    return InitialRig(start, handeye, reference_camera, lead.scale_source, failed, lead.notes)
+    notes = lead.notes + tuple(
+        f"{name}: in very many pieces; the longest were used to tie it to {reference_camera}, {left_out} poses were not"
+        for name, member in handeye.cameras.items()
+        if (left_out := member.statistics.get("poses_left_out", 0))
+    )
+    return InitialRig(start, handeye, reference_camera, lead.scale_source, failed, notes)
 
 
 def _without_unobservable_offset(member: CalibratedCamera, ref_from_cam: SE3) -> SE3:

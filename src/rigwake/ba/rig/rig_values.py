@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rigwake._types import Array, Indices
-from rigwake.ba.solver.rig_problem import BundleCamera, RigProblem, RigSolution
+from rigwake.ba.solver.rig_problem import BundleCamera, RigProblem, RigSolution, VectorPrior
 from rigwake.errors import UsageError
 from rigwake.recording import AttitudeStream, GnssStream, ImuStream
 from rigwake.tracks import Tracks
@@ -96,7 +96,8 @@ class AdjustedRig:
 
     solution: of the last round. track_cameras, track_ids: as in `AssembledProblem`.
     noise_factors: by camera, how much larger the residuals are than the trackers assumed; the observations'
-    `std_px` already contain it. dropped: observations left out as wrong, by camera.
+    `std_px` already contain it. dropped: observations left out as wrong, by camera. intrinsics_priors: by camera, what
+    was believed of intrinsics that were estimated; the problem's own priors also hold what the motion does not tell.
     """
 
     solution: RigSolution
@@ -104,3 +105,4 @@ class AdjustedRig:
     track_ids: Indices
     noise_factors: Mapping[str, float]
     dropped: Mapping[str, int]
+    intrinsics_priors: Mapping[str, VectorPrior] = field(default_factory=dict)

@@ -182,7 +182,9 @@ def _with_unobservable_directions(covariance: RigCovariance, rows: Array) -> Arr
         # an open direction that all cameras share does not touch one as seen from another: what is left is rounding
         sizes = np.linalg.norm(lost / units[:, None], axis=0)
         without_cancelling = np.abs(rows) @ np.abs(covariance.unobservable.T) / units[:, None]
-        lost = lost[:, sizes > _CANCELLED * np.linalg.norm(without_cancelling, axis=0)]
+        touched = sizes > _CANCELLED * np.linalg.norm(without_cancelling, axis=0)
+        # nor does one that lies elsewhere, as in the antenna alone
+        lost = lost[:, touched & covariance.touched(rows).any(axis=0)]
         lost = lost / np.maximum(np.abs(lost / units[:, None]).max(axis=0), 1e-12)
         joint = joint + lost @ lost.T
     return np.asarray(joint)

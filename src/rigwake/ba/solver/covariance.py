@@ -10,6 +10,7 @@ or a damped inverse would print a number there; this module prints none.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from rigwake.ba.solver.clusters import clustered_scatter
 from rigwake.ba.solver.envelope import Factor, NotPositiveDefiniteError
 from rigwake.ba.solver.levenberg_marquardt import equations_of, linearised, structure_of
 from rigwake.ba.solver.normal import ReducedEquations
-from rigwake.ba.solver.parameter_layout import ParameterLayout
+from rigwake.ba.solver.parameter_layout import OwnedParameter, ParameterLayout
 from rigwake.ba.solver.rig_problem import RigProblem, SolverOptions
 from rigwake.errors import EstimationError, UsageError
 from rigwake.parallel import one_blas_thread
@@ -28,6 +29,7 @@ from rigwake.parallel import one_blas_thread
 _LEAST_FRACTION = (
     1e-9  # of the information left; below, rounding speaks (sigma > 3e4 times the conditional one)
 )
+_LEAST_NEGATIVE = -1e-6  # shares below are no rounding
 _ROUNDING = 1e-12  # added to the states' scaled diagonal, so that a free gauge of theirs can be eliminated
 _TOUCHED = 1e-5  # a quantity whose (unit) direction has more than this of an unobservable one is unobservable
 
@@ -68,16 +70,18 @@ class RigCovariance:
 
         Rows and columns of unobservable quantities are NaN.
         """
-        scaled = np.atleast_2d(rows) * self.scale
-        good = self.observable
-        components = scaled @ self.directions
-        lost = np.linalg.norm(components[:, ~good], axis=1)
-        observable = lost <= _TOUCHED * np.maximum(np.linalg.norm(components, axis=1), 1e-300)
+        observable = ~self.touched(rows).any(axis=1)
         half = self.spread(rows)
         covariance = half @ half.T
         covariance[~observable] = np.nan
         covariance[:, ~observable] = np.nan
         return covariance, np.asarray(observable)
+
+    def touched(self, rows: Array) -> Mask:
+        """(q, u) which quantities `rows @ parameters` each unobservable direction has a part in, beyond rounding."""
+        components = (np.atleast_2d(rows) * self.scale) @ self.directions
+        sizes = np.maximum(np.linalg.norm(components, axis=1), 1e-300)
+        return np.asarray(np.abs(components[:, ~self.observable]) > _TOUCHED * sizes[:, None])
 
     def spread(self, rows: Array) -> Array:
         """(q, g) root of the covariance of `rows @ parameters` (q, k), determined directions only."""
@@ -113,11 +117,14 @@ def covariance_of(
     *,
     states: bool = False,
     clustered: bool = False,
+    prior_spreads: Mapping[OwnedParameter, Array] | None = None,
 ) -> RigCovariance:
     """Covariances at the values of a problem, which should be its optimum (`solution.problem`).
 
     options: those of the solve: weights of robust losses count. states: also the marginal covariances of all
     states (by selected inversion). clustered: widen the shared parameters' by errors that last along tracks.
+    prior_spreads: by
+    shared parameter, how much larger (w, w) the scatter of its prior's scores really is than its information says.
     Raises EstimationError if a state has no information at all.
     """
     wanted = options or SolverOptions()
@@ -135,12 +142,26 @@ def covariance_of(
         n = structure.layout.n_state_columns
         scale = 1 / np.sqrt(np.maximum(equations.diagonal[n:], np.finfo(float).tiny ** 0.5))
         fractions, directions = np.linalg.eigh(reduced.shared * np.outer(scale, scale))
+        if len(fractions) and fractions[0] < _LEAST_NEGATIVE:
+            raise EstimationError(
+                f"The information of the rig has a negative eigenvalue ({fractions[0]:.1e} of the scaled matrix).",
+                consequence="No least-squares problem has one: the covariance would be wrong.",
+                remedy="Please report this with the recording; other settings of `adjustment` may avoid it.",
+            )
         found = RigCovariance(structure.layout, reduced.shared, scale, fractions, directions)
         if states:
             found = replace(found, state_covariances=_of_states(found, reduced))
+        surplus = np.zeros_like(found.information)
         if clustered:
             observed, predicted = clustered_scatter(linear.observations, linear.poses, found.layout, reduced)
-            found = replace(found, excess=_excess(found, observed - predicted))
+            surplus = observed - predicted
+        if clustered or prior_spreads:
+            excess = _excess(found, surplus)
+            for (owner, parameter), spread in (prior_spreads or {}).items():
+                # apart from the others: it is positive and may be larger by many orders
+                own = found.rows_of(owner, parameter)
+                excess = excess + _excess(found, own.T @ spread @ own)
+            found = replace(found, excess=excess)
         return found
 
 

@@ -30,7 +30,7 @@ from rigwake.ba.solver.schur import (
     landmark_steps,
 )
 from rigwake.ba.solver.state_motion import TimedPoses
-from rigwake.errors import EstimationError
+from rigwake.errors import CameraError, EstimationError
 from rigwake.parallel import one_blas_thread
 
 _LARGEST_DAMPING = 1e12
@@ -197,9 +197,12 @@ def _trial(
     landmark_moves = landmark_steps(linear.observations, reduced, frame_step, step[layout.extras_start :])
     problem = linear.problem
     bases = tangent_bases(problem.landmarks.bearings_world)
-    # where next to nothing is determined, a step that is hardly damped may lead beyond all floats
-    with np.errstate(over="ignore", invalid="ignore"):
-        moved = linearised(retract(problem, layout, step, landmark_moves, bases), structure, options)
+    # where next to nothing is determined, a step that is hardly damped may lead beyond all floats, or all lenses
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = linearised(retract(problem, layout, step, landmark_moves, bases), structure, options)
+    except CameraError:
+        return None
     if not np.isfinite(moved.cost):
         return None
     shared = step[layout.n_state_columns :]

@@ -222,7 +222,7 @@ def _position(i, j, n, tile, first, offsets):  # type: ignore[no-untyped-def]
 def _scatter_states(  # type: ignore[no-untyped-def]
     begin, end, blocks, row_starts, partners, columns, by_states, w, n, states, tile, first, offsets
 ):
-    """Add `J_f^T S J_g` of every pair (f, g) and its transpose; the partners of one state are summed first."""
+    """Add `J_f^T S J_g` of every pair (f, g) and its transpose; partners of the same states are summed first."""
     neighbours, padded = by_states.shape[1], by_states.shape[3]
     right, product = np.empty((neighbours, 6, padded)), np.empty((padded, padded))
     for f in range(begin, end):
@@ -230,7 +230,8 @@ def _scatter_states(  # type: ignore[no-untyped-def]
         while pair < stop:
             of_state = columns[partners[pair]]
             right[:] = 0.0
-            while pair < stop and columns[partners[pair], 0] == of_state[0]:
+            # frames between two states have as many: all of them must agree, not only the first
+            while pair < stop and (columns[partners[pair]] == of_state).all():
                 g = partners[pair]
                 # a frame with itself comes once, and is added with its transpose
                 fraction = 0.5 if g == f else 1.0
