@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from board_simulation import looking_poses, simulated_corners
-from calibrated_rigs import PINHOLE
+from calibrated_rigs import PINHOLE, boat
 from cli_runs import START_NS, Ended, run, write_examples
 from rigwake.cameras.formats.camera_files import write_cameras
 from rigwake.cameras.registry import CAMERA_CLASSES
@@ -18,6 +18,7 @@ from rigwake.cli import options as cli_options
 from rigwake.cli.main import VERBS, build_app
 from rigwake.exporters import FORMATS
 from rigwake.intrinsics.boards import parse_board
+from rigwake.logbook.store import Logbook
 from rigwake.simulation.scenario import preset_names
 
 SIMPLY_EXPORTED = [name for name in FORMATS if name not in ("basalt", "mrcal", "opencv", "ros-static-tf")]
@@ -132,6 +133,43 @@ USED = [
     ("simulate {list} -o {here}/s.bag --jobs 1 --workers 1 --truth-images --no-show", 2, "list.yaml"),
     ("simulate demo --out {here}/s.xyz", 2, "suffix"),
     ("simulate demo --output {here}/s.xyz", 2, "suffix"),
+    # a wrong recording, or one too short: refused before any work
+    (
+        "surround {calibration} {images} -o {here}/s1.png --view topdown --at 1 --size 64x32 --stabilise off "
+        "--surface water --shell-m 30 --height-m 2 --hull mask --radius-m 20 --bumper-m 3 --vessel 12x4 --yaw 10 "
+        "--fov 80 --trajectory {rig_tum} --topic camera.front=/a --topics {topics} --json {here}/s1.json",
+        (0, 1, 2, 3),
+        "",
+    ),
+    ("surround {calibration} --serve --host 127.0.0.1 --from front", 2, "CAMERA=URL"),
+    (
+        "surround {calibration} {images} --out {here}/s2.xyz --camera-file front={lens}",
+        2,
+        "what should .xyz be",
+    ),
+    ("surround {calibration} {images} --output {here}/s3.xyz", 2, "what should .xyz be"),
+    (
+        "monitor {calibration} {images} -o {here}/m1 --log {here}/m1.db --topic camera.front=/a --topics {topics} "
+        "--camera-file front={lens} --json {here}/m1.json",
+        1,
+        "not of the calibrated vessel",
+    ),
+    ("monitor {calibration} {images} --out {here}/m2", 1, "not of the calibrated vessel"),
+    ("monitor {calibration} {images} --output {here}/m3", 1, "not of the calibrated vessel"),
+    (
+        "recalibrate {calibration} {images} -o {here}/r1.yaml --log {here}/r1.db --topic camera.front=/a "
+        "--topics {topics} --camera-file front={lens} --json {here}/r1.json",
+        1,
+        "not of the calibrated vessel",
+    ),
+    ("recalibrate {calibration} {images} --out {here}/r2.yaml", 1, "not of the calibrated vessel"),
+    ("recalibrate {calibration} {images} --output {here}/r3.yaml", 1, "not of the calibrated vessel"),
+    ("log add {here}/new.db {calibration} --from 2026-05-01T08:00 --note spring", 0, "next:"),
+    ("log list {logbook} --json -", 0, "calibrations"),
+    ("log list {logbook} --json {here}/list.json", 0, "summer"),
+    ("log show {logbook} 1 -o {here}/then.yaml", 0, "written"),
+    ("log plot {logbook} --out {here}/history.html", 0, "written"),
+    ("log export {logbook} --output {here}/copy.db", 0, "written"),
     ("demo -o {text}", 2, "is a file"),
     ("demo --out {text}", 2, "is a file"),
     ("demo --output {text}", 2, "is a file"),
@@ -168,6 +206,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
             rows.append(f"{START_NS + k},{i},0,{u:.4f},{v:.4f},{x:.5f},{y:.5f},{z:.5f}")
     (folder / "corners.csv").write_text("\n".join(rows) + "\n")
     write_cameras(folder / "lens.yaml", {"front": PINHOLE})
+    with Logbook(folder / "vessel.db", create=True) as book:
+        book.add(boat(lens=PINHOLE), START_NS, "summer")
+    names["logbook"] = folder / "vessel.db"
     for name in ("settings", "good_prior", "imu", "lens"):
         names[name] = folder / f"{name}.yaml"
     return names | {"mask": folder / "mask.png"}
@@ -243,7 +284,7 @@ def test_help_of_every_verb(verb: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "verb", ["calibrate", "odometry", "intrinsics", "handeye", "export", "simulate", "demo"]
+    "verb", [verb for verb in VERBS if verb not in ("inspect", "evaluate", "diff", "report")]
 )
 def test_outputs_have_one_spelling(verb: str) -> None:
     assert "--out" in run(verb, "--help").out

@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from rigwake.cli.console import figures_table, next_step, out, write_json
-from rigwake.cli.options import JsonOption, require
+from rigwake.cli.options import JsonOption, completed_from, require, require_there, require_writable
 from rigwake.errors import UsageError
 
 if TYPE_CHECKING:
@@ -20,7 +20,9 @@ ACTIONS = ("add", "list", "show", "diff", "at", "plot", "export")
 
 
 def command(
-    action: Annotated[str, typer.Argument(help=f"One of {', '.join(ACTIONS)}.")],
+    action: Annotated[
+        str, typer.Argument(help=f"One of {', '.join(ACTIONS)}.", autocompletion=completed_from(ACTIONS))
+    ],
     vessel: Annotated[Path, typer.Argument(metavar="VESSEL.db", help="The logbook.")],
     what: Annotated[
         list[str] | None,
@@ -31,7 +33,7 @@ def command(
     ] = None,
     note: Annotated[str, typer.Option(help="add: a word about it.")] = "",
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="plot, export, show, at: a file.")
+        Path | None, typer.Option("-o", "--out", "--output", help="plot, export, show, at: a file.")
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
@@ -43,8 +45,6 @@ def command(
 
     Example: [cyan]rigwake log at vessel.db 2026-05-03T12:00 -o then.yaml[/cyan]
     """
-    from rigwake.logbook.store import Logbook
-
     require("action", action, ACTIONS)
     arguments = what or []
     needed = {"add": 1, "show": 1, "diff": 2, "at": 1}.get(action, 0)
@@ -53,6 +53,11 @@ def command(
             f"log {action} takes {needed} argument{'s' * (needed != 1)} after the logbook, not {len(arguments)}.",
             remedy="See `rigwake log --help`.",
         )
+    require_writable("-o", output)
+    require_writable("--json", json_file)
+    require_there(Path(arguments[0]) if action == "add" else vessel)
+    from rigwake.logbook.store import Logbook
+
     if action == "add":
         _add(vessel, Path(arguments[0]), valid_from, note)
         return
@@ -117,7 +122,7 @@ def _add(vessel: Path, file: Path, valid_from: str | None, note: str) -> None:
     with Logbook(vessel, create=True) as book:
         number = book.add(calibration, begin, note or file.name)
     out.print(f"calibration {number}, from {time_words(begin)}", markup=False, highlight=False)
-    next_step(f"rigwake log list {vessel}", "see the history")
+    next_step(["rigwake", "log", "list", vessel], "see the history")
 
 
 def _list(book: Logbook, json_file: Path | None) -> None:

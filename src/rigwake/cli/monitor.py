@@ -9,7 +9,14 @@ import typer
 from rich.markup import escape
 
 from rigwake.cli.console import next_step, out, progress_bars, write_json
-from rigwake.cli.options import CameraFileOption, JsonOption, TopicOption, TopicsOption
+from rigwake.cli.options import (
+    CameraFileOption,
+    JsonOption,
+    TopicOption,
+    TopicsOption,
+    require_there,
+    require_writable,
+)
 
 _COLOURS = {
     "OK": "green",
@@ -24,7 +31,7 @@ def command(
     calibration: Annotated[Path, typer.Argument(help="calibration.yaml of this vessel.")],
     recording: Annotated[Path, typer.Argument(help="What it recorded later: ROS bag, MCAP, folder.")],
     out_folder: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Folder for monitor.html and monitor.json.")
+        Path | None, typer.Option("-o", "--out", "--output", help="Folder for monitor.html and monitor.json.")
     ] = None,
     log: Annotated[
         Path | None, typer.Option("--log", metavar="VESSEL.db", help="Logbook that the verdicts go into.")
@@ -40,6 +47,10 @@ def command(
 
     Example: [cyan]rigwake monitor calibration.yaml today.bag -o OUT --log vessel.db[/cyan]
     """
+    require_there(calibration, recording, topics)
+    require_writable("-o", out_folder, folder=True)
+    require_writable("--log", log)
+    require_writable("--json", json_file)
     from rigwake.calibration import load_calibration
     from rigwake.logbook.store import Logbook
     from rigwake.monitor.monitor_page import write_page
@@ -80,10 +91,13 @@ def command(
             out.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
         if result.blamed:
             next_step(
-                f"rigwake recalibrate {calibration} {recording} -o NEW.yaml", "measure the camera that moved"
+                ["rigwake", "recalibrate", calibration, recording, "-o", "NEW.yaml"],
+                "measure the camera that moved",
             )
-        elif out_folder is not None:
-            next_step(f"open {out_folder / 'monitor.html'}", "see the timeline")
+        elif log is not None:
+            next_step(["rigwake", "log", "list", log], "the history of this vessel")
+        else:
+            next_step(["rigwake", "log", "--help"], "keep a history: monitor with --log VESSEL.db")
     if result.exit_code:
         raise typer.Exit(result.exit_code)
 

@@ -8,7 +8,14 @@ from typing import Annotated
 import typer
 
 from rigwake.cli.console import next_step, out, progress_bars, write_json
-from rigwake.cli.options import CameraFileOption, JsonOption, TopicOption, TopicsOption
+from rigwake.cli.options import (
+    CameraFileOption,
+    JsonOption,
+    TopicOption,
+    TopicsOption,
+    require_there,
+    require_writable,
+)
 
 
 def command(
@@ -16,7 +23,7 @@ def command(
     recording: Annotated[
         Path, typer.Argument(help="The recording in which the camera moved, or a later one.")
     ],
-    new: Annotated[Path, typer.Option("-o", "--out", help="File of the new calibration.")],
+    new: Annotated[Path, typer.Option("-o", "--out", "--output", help="File of the new calibration.")],
     log: Annotated[
         Path | None,
         typer.Option("--log", metavar="VESSEL.db", help="Logbook in which it supersedes the old one."),
@@ -30,6 +37,10 @@ def command(
 
     Example: [cyan]rigwake recalibrate calibration.yaml today.bag -o new.yaml --log vessel.db[/cyan]
     """
+    require_there(calibration, recording, topics)
+    require_writable("-o", new)
+    require_writable("--log", log)
+    require_writable("--json", json_file)
     from rigwake.calibration import load_calibration, save_calibration
     from rigwake.calibration.yaml_file import plain
     from rigwake.errors import UsageError
@@ -70,4 +81,4 @@ def command(
         highlight=False,
     )
     out.print(f"written: {new}", markup=False, highlight=False)
-    next_step(f"rigwake diff {calibration} {new}", "see what changed, in pixels too")
+    next_step(["rigwake", "diff", calibration, new], "see what changed, in pixels too")

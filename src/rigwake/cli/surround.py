@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rigwake.cli.console import next_step, out, progress_bar, write_json
-from rigwake.cli.options import CameraFileOption, JsonOption, TopicOption, TopicsOption, require
+from rigwake.cli.options import (
+    CameraFileOption,
+    JsonOption,
+    TopicOption,
+    TopicsOption,
+    completed_from,
+    require,
+    require_there,
+    require_writable,
+)
 from rigwake.errors import UsageError
 
 if TYPE_CHECKING:
@@ -34,9 +43,13 @@ def command(
     port: Annotated[int | None, typer.Argument(help=f"Port of --serve (default {_PORT}; 0: any).")] = None,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="OUT.mp4, OUT.png, OUT.jpg, or a folder for everything."),
+        typer.Option(
+            "-o", "--out", "--output", help="OUT.mp4, OUT.png, OUT.jpg, or a folder for everything."
+        ),
     ] = None,
-    view: Annotated[str, typer.Option(help=f"One of {', '.join(_VIEWS)}.")] = "panorama",
+    view: Annotated[
+        str, typer.Option(help=f"One of {', '.join(_VIEWS)}.", autocompletion=completed_from(_VIEWS))
+    ] = "panorama",
     at: Annotated[
         float | None, typer.Option(help="Seconds after the first picture; default: the middle.")
     ] = None,
@@ -84,6 +97,9 @@ def command(
 
     Example: [cyan]rigwake surround OUT sail.bag --serve 8360[/cyan]
     """
+    live_port = live and recording is not None and recording.name.isdecimal() and not recording.exists()
+    require_there(calibration, None if live_port else recording, topics, trajectory)
+    require_writable("--json", json_file)
     from rigwake.readers.topics import TopicMap
     from rigwake.views.prepare import STABILISERS, SURFACES, SurroundOptions, prepare_surround
     from rigwake.views.present import Decoration
@@ -92,7 +108,7 @@ def command(
     require("--stabilise", stabilise, STABILISERS)
     require("--surface", surface, SURFACES)
     require("--hull", hull, ("show", "mask"))
-    if live and recording is not None and recording.name.isdecimal() and not recording.exists():
+    if live_port and recording is not None:
         port = int(recording.name)  # CALIB --serve PORT --from ...
         recording = None
     _check_use(recording, output, serve, live, port)
@@ -131,7 +147,9 @@ def command(
     _write(setup, projection, decoration, output, at, radius_m)
     _report(setup, output, json_file, recording.name)
     if str(json_file) != "-":
-        next_step(f"rigwake surround {calibration} {recording} --serve", "look around, live in the browser")
+        next_step(
+            ["rigwake", "surround", calibration, recording, "--serve"], "look around, live in the browser"
+        )
 
 
 def _check_use(
@@ -149,6 +167,7 @@ def _check_use(
         return
     if output is None:
         raise UsageError("Nothing to write to.", remedy="Give -o OUT.png, OUT.mp4 or a folder, or --serve.")
+    require_writable("-o", output, folder=output.is_dir() or not output.suffix)
     if output.suffix and output.suffix.lower() not in (*_PICTURES, *_VIDEOS) and not output.is_dir():
         raise UsageError(
             f"{output}: what should {output.suffix} be?",
