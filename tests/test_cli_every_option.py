@@ -65,6 +65,11 @@ USED = [
         1,
         "no frames",
     ),
+    (
+        "odometry {images} -o {here}/o7 --stereo front,left --rig {calibration}",
+        2,
+        "No camera 'left' in this rig.",
+    ),
     ("odometry {images} --output {here}/o3 --camera front --front-end orb", 1, "no frames"),
     (
         "handeye {rig_tum} {port_tum} -o {here}/h.yaml --method ml --noise increments --time-offset",

@@ -137,6 +137,13 @@ WRONG = [
     ("report {nowhere}", 1, "There is no file or folder"),
     ("report {empty}", 1, "holds no calibration.yaml."),
     ("report {taken} --figures {here}/figures --figure-format gif", 2, "Choose from png, svg"),
+    ("odometry {images} -o {here}/new --stereo front", 2, "needs two cameras"),
+    (
+        "odometry {images} -o {here}/new --stereo front,fornt --rig {calibration}",
+        2,
+        "No camera 'fornt' in images.",
+    ),
+    ("odometry {images} -o {here}/new --stereo front,left --rig {nowhere}", 1, "There is no file"),
     # the surround view
     ("surround {calibration}", 2, "Nothing to show."),
     ("surround {calibration} {images}", 2, "Nothing to write to."),
