@@ -4,15 +4,17 @@ import contextlib
 import io
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import typer
 import yaml
 
 from calibrated_rigs import PINHOLE, boat, without_vertical
 from rigwake.calibration import save_calibration
 from rigwake.cameras.registry import camera_to_dict
-from rigwake.cli.main import main
+from rigwake.cli.main import build_app, main
 from rigwake.geometry.se3 import SE3
 from rigwake.trajectory import Trajectory
 from rigwake.writers.trajectory_writer import write_tum
@@ -31,6 +33,15 @@ class Ended:
     @property
     def words(self) -> str:
         return " ".join((self.out + " " + self.err).replace("│", " ").split())
+
+
+def commands_by_words() -> dict[str, Any]:
+    """Every verb's command by its words: `calibrate`, `fleet calibrate`."""
+    found = {}
+    for name, command in typer.main.get_command(build_app()).commands.items():  # type: ignore[attr-defined]
+        inner = getattr(command, "commands", None)
+        found |= {name: command} if inner is None else {f"{name} {verb}": c for verb, c in inner.items()}
+    return found
 
 
 def run(*arguments: object) -> Ended:

@@ -7,15 +7,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import typer
 
 from board_simulation import looking_poses, simulated_corners
 from calibrated_rigs import PINHOLE, boat
-from cli_runs import START_NS, Ended, run, write_examples
+from cli_runs import START_NS, Ended, commands_by_words, run, write_examples
 from rigwake.cameras.formats.camera_files import write_cameras
 from rigwake.cameras.registry import CAMERA_CLASSES
 from rigwake.cli import options as cli_options
-from rigwake.cli.main import VERBS, build_app
+from rigwake.cli.main import GROUPS, VERBS
 from rigwake.exporters import FORMATS
 from rigwake.intrinsics.boards import parse_board
 from rigwake.logbook.store import Logbook
@@ -175,6 +174,36 @@ USED = [
     ("log show {logbook} 1 -o {here}/then.yaml", 0, "written"),
     ("log plot {logbook} --out {here}/history.html", 0, "written"),
     ("log export {logbook} --output {here}/copy.db", 0, "written"),
+    (
+        "fleet calibrate {gone} -o {here}/f1 --jobs 1 --timeout 60 --memory 4 --retries 0 --shard 1/1 --retry-failed "
+        "--vessel x --config {settings} --set seed=5 --topic camera.front=/a --topics {topics} --json {here}/f.json",
+        1,
+        "1 failed (1 missing path)",
+    ),
+    (
+        "fleet calibrate {images} --out {here}/f2 --allow-partial --scheduler tcp://127.0.0.1:9",
+        1,
+        "No scheduler",
+    ),
+    (
+        "fleet monitor {gone} -o {here}/f3 --calibration {calibration} --jobs 1 --timeout 60 --memory 4 --retries 0 "
+        "--shard 1/1 --retry-failed --vessel x --topic camera.front=/a --topics {topics} --json - --allow-partial",
+        1,
+        '"missing path": 1',
+    ),
+    (
+        "fleet monitor {images} --out {here}/f4 --calibration {calibration} --scheduler tcp://127.0.0.1:9",
+        1,
+        "No scheduler",
+    ),
+    (
+        "ros node --out {here}/r1 --calibration {calibration} --topic /imu --child-frame cam_{{name}} "
+        "--monitor-seconds 30 --record __name:=x",
+        1,
+        "ROS",
+    ),
+    ("ros node -o {here}/r2", 1, "ROS"),
+    ("calibrate {images} -o {here}/c4 --scheduler local:1", 3, "3.0 s of images"),
     ("demo -o {text}", 2, "is a file"),
     ("demo --out {text}", 2, "is a file"),
     ("demo --output {text}", 2, "is a file"),
@@ -216,15 +245,16 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     names["logbook"] = folder / "vessel.db"
     for name in ("settings", "good_prior", "imu", "lens"):
         names[name] = folder / f"{name}.yaml"
-    return names | {"mask": folder / "mask.png"}
+    (folder / "gone.txt").write_text("gone.bag\n")
+    return names | {"gone": folder / "gone.txt", "mask": folder / "mask.png"}
 
 
 def test_every_option_of_every_verb_is_used() -> None:
-    commands = typer.main.get_command(build_app()).commands
     used = [shlex.split(command.replace("{", "").replace("}", "")) for command, _, _ in USED]
-    for verb in VERBS:
-        words = {word for typed in used if typed[0] == verb for word in typed}
-        for parameter in commands[verb].params:
+    for verb, command in commands_by_words().items():
+        own = verb.split()
+        words = {word for typed in used if typed[: len(own)] == own for word in typed}
+        for parameter in command.params:
             names = (
                 {*parameter.opts, *parameter.secondary_opts}
                 if parameter.param_type_name == "option"
@@ -253,6 +283,7 @@ def test_options_work(
     monkeypatch.chdir(files["here"])
     monkeypatch.setattr("webbrowser.open", lambda address: True)
     monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:9")  # nobody answers
     ended = run(*(word.format(**files) for word in shlex.split(command)))
     assert ended.code in (code if isinstance(code, tuple) else (code,)), ended.words
     assert said in ended.words
@@ -280,9 +311,9 @@ def test_words_of_help_are_those_of_the_program() -> None:
     assert cli_options.completed_from(("kalibr", "csv"))("k") == ["kalibr"]
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", [*commands_by_words(), *GROUPS])
 def test_help_of_every_verb(verb: str) -> None:
-    long, short = run(verb, "--help"), run(verb, "-h")
+    long, short = run(*verb.split(), "--help"), run(*verb.split(), "-h")
     assert long == short
     assert "Exit codes" in long.words
     assert "4 done, but a camera is missing" in long.words

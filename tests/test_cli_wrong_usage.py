@@ -5,10 +5,8 @@ import time
 from pathlib import Path
 
 import pytest
-import typer
 
-from cli_runs import run, write_examples
-from rigwake.cli.main import VERBS, build_app
+from cli_runs import commands_by_words, run, write_examples
 
 # (command, exit code, words of the message); names in braces are files of `write_examples`
 WRONG = [
@@ -180,6 +178,37 @@ WRONG = [
     ("simulate demo -o {here}/new.bag --duration -1", 2, "a number above 0"),
     ("simulate demo -o {here}/new.bag --jobs 0", 2, "'--jobs'"),
     ("simulate {list} -o {here}/new.bag", 2, "list.yaml"),
+    # fleet and ros
+    ("fleet calibrat {images}", 2, "No such command 'calibrat'"),
+    ("fleet calibrate", 2, "Missing argument"),
+    ("fleet calibrate {images}", 2, "Missing option"),
+    ("fleet calibrate {nowhere} -o {here}/new", 1, "There is no file or folder"),
+    ("fleet calibrate {empty} -o {here}/new", 2, "No recording is in"),
+    ("fleet calibrate {here}/none*.bag -o {here}/new", 2, "No recording is in"),
+    ("fleet calibrate {images} -o {text}", 2, "is a file, a folder is wanted."),
+    ("fleet calibrate {images} -o {here}/new --shard 3", 2, "is no part."),
+    ("fleet calibrate {images} -o {here}/new --shard 0/3", 2, "is no part."),
+    ("fleet calibrate {images} -o {here}/new --shard 4/3", 2, "is no part."),
+    ("fleet calibrate {images} -o {here}/new --scheduler here", 2, "is no address."),
+    ("fleet calibrate {images} -o {here}/new --scheduler local:0", 2, "is no address."),
+    ("fleet calibrate {images} -o {here}/new --timeout 0", 2, "a number above 0"),
+    ("fleet calibrate {images} -o {here}/new --timeout nan", 2, "a number above 0"),
+    ("fleet calibrate {images} -o {here}/new --memory -1", 2, "a number above 0"),
+    ("fleet calibrate {images} -o {here}/new --retries -1", 2, "'--retries'"),
+    ("fleet calibrate {images} -o {here}/new --jobs -1", 2, "'--jobs'"),
+    ("fleet calibrate {images} -o {here}/new --config {nowhere}", 1, "There is no file"),
+    ("fleet calibrate {images} -o {here}/new --set speed=3", 2, "Setting speed"),
+    ("fleet calibrate {images} -o {here}/new --topic radar=/x", 2, "does not say which sensor"),
+    ("fleet monitor {images} -o {here}/new", 2, "Missing option '--calibration'"),
+    ("fleet monitor {images} -o {here}/new --calibration {nowhere}", 1, "There is no file"),
+    ("fleet monitor {images} -o {here}/new --calibration {broken}", 1, "broken.yaml"),
+    ("fleet monitor {images} -o {here}/new --calibration {empty}", 2, "No calibration of the vessel"),
+    ("calibrate {images} -o {here}/new --scheduler here", 2, "is no address."),
+    ("ros node loud", 2, "is no remapping."),
+    ("ros node -o {text}", 2, "is a file, a folder is wanted."),
+    ("ros node --calibration {nowhere}", 1, "There is no file"),
+    ("ros node --child-frame cam -o {here}/new", 2, "names all cameras alike."),
+    ("ros node --monitor-seconds -1 -o {here}/new", 2, "a number above"),
     ("demo -o {text}", 2, "is a file, a folder is wanted."),
 ]
 
@@ -193,11 +222,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture(scope="module")
 def options() -> dict[str, set[str]]:
     """All options of every verb."""
-    commands = typer.main.get_command(build_app()).commands
     return {
-        verb: {name for p in commands[verb].params for name in (*p.opts, *p.secondary_opts)}
-        | {"--help", "-h"}
-        for verb in VERBS
+        verb: {name for p in command.params for name in (*p.opts, *p.secondary_opts)} | {"--help", "-h"}
+        for verb, command in commands_by_words().items()
     }
 
 

@@ -14,6 +14,7 @@ LAYERS = [
         "_types",
         "atomic",
         "fingerprint",
+        "host_faults",
         "parallel",
         "workers",
         "kernel_cache",
@@ -43,6 +44,8 @@ LAYERS = [
     ["logbook"],  # the history of a vessel
     ["monitor"],
     ["views"],
+    ["fleet"],  # many recordings, on one machine or a cluster
+    ["ros"],  # a node on board; imported by the command line alone
     ["cli", "__main__"],
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -17,6 +17,7 @@ from rigwake.cli.options import (
     TopicOption,
     TopicsOption,
     horizon_choice,
+    require_scheduler,
     require_there,
     require_writable,
 )
@@ -69,6 +70,10 @@ def command(
     assignments: Annotated[
         list[str] | None, typer.Option("--set", help="One setting: adjustment.cross_camera=false.")
     ] = None,
+    scheduler: Annotated[
+        str,
+        typer.Option(help="Dask cluster for the camera stage: tcp://HOST:PORT, or local:N (extra `fleet`)."),
+    ] = "",
     view: Annotated[
         bool, typer.Option("--view", help="Show the result in the rerun viewer (extra `rerun`).")
     ] = False,
@@ -88,6 +93,7 @@ def command(
     if recording is not None:
         require_writable("-o", out_folder, folder=True)
         require_writable("--json", json_file)
+        require_scheduler(scheduler)
         check_out_folder(out_folder, [recording], force=force, resume=resume)
     from rigwake.calibration.yaml_file import calibration_to_dict
     from rigwake.config import load_config
@@ -127,6 +133,7 @@ def command(
             resume=resume,
             force=force,
             progress=bars,
+            **_on_cluster(scheduler),
         )
     if json_file is not None:
         write_json(json_file, calibration_to_dict(run.calibration))
@@ -143,6 +150,14 @@ def command(
             consequence=f"The others are in {run.out / 'calibration.yaml'}.",
             remedy="See the reasons above. With --allow-partial, such a result counts as done (exit code 0).",
         )
+
+
+def _on_cluster(scheduler: str) -> dict[str, Any]:
+    if not scheduler:
+        return {}
+    from rigwake.fleet.dask_run import cameras_on_cluster
+
+    return {"run_cameras": cameras_on_cluster(scheduler)}
 
 
 def _print_run(run: CalibrationRun) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import typer
 
@@ -41,6 +41,9 @@ VERBS: tuple[str, ...] = (
     "demo",
 )
 
+# one module per group of verbs, each with `COMMANDS`: verb -> function
+GROUPS: tuple[str, ...] = ("fleet", "ros")
+
 EXIT_CODES = (
     "Exit codes: 0 done; 1 failed; 2 wrong usage; 3 the motion cannot determine it; 4 done, but a camera is missing "
     "from the result; 5 a camera has moved (monitor)."
@@ -61,8 +64,8 @@ def _root(
     """Calibrate a camera rig from the wake it leaves."""
 
 
-def build_app(verbs: Sequence[str] = VERBS) -> typer.Typer:
-    """The command-line application with these verbs."""
+def build_app(verbs: Sequence[str] = (*VERBS, *GROUPS)) -> typer.Typer:
+    """The command-line application with these verbs and groups of verbs."""
     app = typer.Typer(
         name="rigwake",
         no_args_is_help=True,
@@ -74,8 +77,24 @@ def build_app(verbs: Sequence[str] = VERBS) -> typer.Typer:
     app.callback()(_root)
     for verb in verbs:
         module = importlib.import_module(f"rigwake.cli.{verb}")
-        app.command(verb, epilog=EXIT_CODES)(module.command)
+        if verb in GROUPS:
+            app.add_typer(_group(module.COMMANDS, module.__doc__ or ""), name=verb)
+        else:
+            app.command(verb, epilog=EXIT_CODES)(module.command)
     return app
+
+
+def _group(commands: Mapping[str, Callable[..., None]], help_text: str) -> typer.Typer:
+    """Verbs of two words, such as `fleet calibrate`."""
+    group = typer.Typer(
+        no_args_is_help=True,
+        help=help_text,
+        epilog=EXIT_CODES,
+        context_settings={"help_option_names": ["--help", "-h"]},
+    )
+    for name, command in commands.items():
+        group.command(name, epilog=EXIT_CODES)(command)
+    return group
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -111,7 +130,8 @@ def _exit_code(words: list[str]) -> int:
 def _run(words: list[str]) -> int:
     try:
         _say_where_kernels_are(words)
-        only = words[:1] if words and words[0] in VERBS else VERBS  # the others need not be imported
+        known = (*VERBS, *GROUPS)
+        only = words[:1] if words and words[0] in known else known  # the others need not be imported
         build_app(only)(words, prog_name="rigwake")
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else int(bool(ended.code))
@@ -121,7 +141,7 @@ def _run(words: list[str]) -> int:
 def _say_where_kernels_are(words: list[str]) -> None:
     """Say once that compiled loops are kept among the temporary files."""
     folder = provide_kernel_cache()
-    if folder is not None and words[:1] and words[0] in VERBS and not any(folder.iterdir()):
+    if folder is not None and words[:1] and words[0] in (*VERBS, *GROUPS) and not any(folder.iterdir()):
         err.print(
             f"note: neither the installation nor a home folder can be written; compiled loops are kept in {folder} "
             "(choose another place with NUMBA_CACHE_DIR)",

@@ -12,6 +12,7 @@ from __future__ import annotations
 import difflib
 import math
 import os
+import re
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -115,6 +116,14 @@ def require_number(
         wanted = "a number" if above is None else f"a number above {above:g}"
         wanted += "" if math.isinf(below) else f" and below {below:g}"
         raise UsageError(f"{option} {value:g} is not possible.", remedy=f"Give {wanted}.")
+
+
+def require_scheduler(words: str) -> None:
+    """UsageError for what is neither empty nor an address of a cluster."""
+    if words and not re.fullmatch(r"local:[1-9]\d{0,3}|(tcp|tls|ucx|wss?)://\S+", words):
+        raise UsageError(
+            f"--scheduler {words[:80]!r} is no address.", remedy="Give tcp://HOST:PORT or local:N."
+        )
 
 
 def require_there(*paths: Path | None) -> None:

@@ -23,7 +23,7 @@ from rigwake.pipeline.before_start import (
     without_cameras,
 )
 from rigwake.pipeline.camera_key import camera_key
-from rigwake.pipeline.camera_processes import Progress, process_cameras
+from rigwake.pipeline.camera_processes import CameraRunner, Progress, process_cameras
 from rigwake.pipeline.camera_stage import (
     CameraJob,
     CameraOutcome,
@@ -96,12 +96,13 @@ def calibrate(
     resume: bool = False,
     force: bool = False,
     progress: Progress = _silent,
+    run_cameras: CameraRunner = process_cameras,
 ) -> CalibrationRun:
     """Find where every camera of a recording sits and looks.
 
     out: folder for `calibration.yaml` and what the stages leave; see docs/calibrate.md. trajectories: a folder of
     `CAMERA.tum` made by another odometry. prior: what is known beforehand. resume: keep finished stages. force:
-    replace the result of another run.
+    replace the result of another run. run_cameras: where the camera stage runs, by default in processes here.
 
     Raises InputError (the recording), UsageError (the settings, or a folder that holds another result or is in use),
     UnobservableError (the motion cannot tell), EstimationError (it should, but no trustworthy answer was found),
@@ -117,7 +118,7 @@ def calibrate(
             identity = input_fingerprint(path)
             provenance = _provenance(identity, prepared, topics, external)
             ledger = StageLedger(out, resume=resume)
-            selection, outcomes, checks = _each_camera(prepared, out, ledger, identity, progress)
+            selection, outcomes, checks = _each_camera(prepared, out, ledger, identity, progress, run_cameras)
             check_unchanged()
             estimated = _estimate(prepared, out, selection, outcomes, progress)
             check_unchanged()
@@ -215,7 +216,12 @@ def _conclude(
 
 
 def _each_camera(
-    prepared: _Prepared, out: Path, ledger: StageLedger, identity: Mapping[str, Any], progress: Progress
+    prepared: _Prepared,
+    out: Path,
+    ledger: StageLedger,
+    identity: Mapping[str, Any],
+    progress: Progress,
+    run_cameras: CameraRunner,
 ) -> tuple[Selection, list[CameraOutcome], tuple[SensorCheck, ...]]:
     """Mask, tracks and odometry of every camera; those that a former run finished are read from its files.
 
@@ -255,7 +261,7 @@ def _each_camera(
 
     if jobs:
         clear_results(out, everything=False)
-        process_cameras(jobs, config.jobs, progress, finished)
+        run_cameras(jobs, config.jobs, progress, finished)
     return selection, [outcomes[name] for name in selection.cameras], checks
 
 

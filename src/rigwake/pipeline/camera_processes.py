@@ -10,6 +10,10 @@ from rigwake.workers import StageProgress, run_in_processes
 Progress = Callable[[str, str, float], None]
 """Told a camera's name, what it is doing, and which fraction of it is done."""
 
+Finished = Callable[[CameraOutcome], None]
+CameraRunner = Callable[[Sequence[CameraJob], int, Progress, Finished], list[CameraOutcome]]
+"""What does the camera stage: `process_cameras`, or a cluster."""
+
 _SEND_EVERY = 0.01  # of a fraction
 
 
