@@ -19,6 +19,7 @@ from rigwake.simulation.record import Shot, build_world, render_recording, work_
 from rigwake.simulation.render import Renderer
 from rigwake.simulation.scenario import ImageNoise, Scenario, Scene, Sea, build_scenario, load_scenario
 from rigwake.simulation.scene_layout import build_layout
+from rigwake.simulation.scenery import KeepClear, build_scenery
 from rigwake.simulation.sea_surface import meet_water, water_at
 from rigwake.simulation.selfcheck import corner_errors, motion_agreement
 from rigwake.simulation.setup import Simulation, prepare
@@ -299,3 +300,12 @@ def test_showing_a_preset_prints_a_scenario_that_loads(tmp_path: Path) -> None:
     copy = tmp_path / "copy.yaml"
     copy.write_text(done.output)
     assert load_scenario(copy) == load_scenario("mast")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size_m", [(110, 30), (30, 30), (30, 200)])
+def test_narrow_water_has_hills_all_around(size_m: tuple[float, float]) -> None:
+    scene = Scene(layout="marina", size_m=size_m, density=0.6)
+    scenery = build_scenery(scene, 5, KeepClear(np.zeros((1, 2)), 4.0))
+    reach = np.abs(scenery.mesh.triangles[..., :2]).max(axis=(0, 1))
+    assert (reach > 800).all()

@@ -37,6 +37,9 @@ VERBS: tuple[str, ...] = (
     "report",
     "convert",
     "surround",
+    "segment",
+    "stixels",
+    "depth",
     "simulate",
     "demo",
 )

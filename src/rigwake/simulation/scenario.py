@@ -38,7 +38,7 @@ class Scene(Strict):
     shore without texture on it.
     """
 
-    layout: Literal["harbour", "bay", "canal"] = "harbour"
+    layout: Literal["harbour", "bay", "canal", "marina"] = "harbour"
     size_m: tuple[Annotated[float, Field(ge=30, le=2000)], Annotated[float, Field(ge=30, le=2000)]] = (
         150,
         110,

@@ -22,6 +22,7 @@ _SIDES: dict[str, tuple[SideKind, SideKind, SideKind, SideKind]] = {  # south, e
     "harbour": ("quay", "quay", "quay", "shore"),
     "bay": ("open", "shore", "shore", "open"),
     "canal": ("quay", "open", "quay", "open"),
+    "marina": ("shore", "quay", "shore", "open"),
 }
 
 

@@ -17,6 +17,7 @@ from rigwake.simulation.textures import Atlas, build_atlas, noise
 
 _PLATEAU_M = 55.0  # flat ground behind a quay, then hills
 _REACH_M = 1100.0
+_PLACES = 0.75  # of that: houses and trees stand no farther out
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +223,7 @@ def _hills(rng: np.random.Generator, layout: SceneLayout, atlas: Atlas, density:
     parts = [from_grid(points, points[..., :2], atlas.number("forest"), (1.1, 1.1, 1.0))]
     height_at = RegularGridInterpolator((y, x), height)
     for _ in range(int(260 * density)):
-        plan = rng.uniform(-0.75, 0.75, 2) * _REACH_M
+        plan = rng.uniform(-_PLACES, _PLACES, 2) * _REACH_M
         ground = float(height_at(plan[::-1])[0])
         if ground < 4.5:
             continue
@@ -235,10 +236,13 @@ def _hills(rng: np.random.Generator, layout: SceneLayout, atlas: Atlas, density:
 
 
 def _spread(half: float) -> Array:
-    """Grid lines, close together near the water and wide apart far out."""
+    """Grid lines, close together near the water and wide apart far out, at least as far as things are placed."""
     near = np.arange(0, half + 150, 10.0)
     far = near[-1] + np.cumsum(np.geomspace(12, 45, 26))
-    positive = np.concatenate([near, far])
+    beyond = np.arange(
+        far[-1] + 45, _PLACES * _REACH_M + 45, 45.0
+    )  # narrow water: none where it is wide enough
+    positive = np.concatenate([near, far, beyond])
     return np.concatenate([-positive[:0:-1], positive])
 
 

@@ -188,7 +188,7 @@ def choose_surface(name: str, shell_m: float, is_height_known: bool) -> SurfaceS
         return FixedSurface(WaterAndShell(_FAR_SHELL_M))
     if name == "stixels":
         try:
-            module = importlib.import_module("rigwake.views.scene.stixels")
+            module = importlib.import_module("rigwake.views.scene.stixel_source")
         except ModuleNotFoundError as error:
             raise UsageError(
                 "This version of rigwake does not estimate stixels.", remedy="Use --surface shell."

@@ -1,0 +1,1 @@
+"""How far away things are: pairs of cameras, a sweep of spheres, and the water plane, fused."""

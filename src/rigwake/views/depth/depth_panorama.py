@@ -1,0 +1,209 @@
+"""Ranges all around in the grid of the level strip: matched on what stands, the plane on water, nothing in the sky."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rigwake._types import Array, Image, Mask
+from rigwake.views.attitude import LevelAttitude
+from rigwake.views.depth.epipolar import MatchedPoints, epipolar_pairs, match_pair
+from rigwake.views.scene.segmentation import NOT_SEEN, OBSTACLE, WATER, Labels
+from rigwake.views.strips import StripGrid
+from rigwake.views.surface import SHELL_M, WaterAndDepth
+from rigwake.views.surround_rig import SurroundRig
+
+NONE, PLANE, MATCHED = 0, 1, 2  # sources
+_AGREE = 3.0  # standard deviations within which points of one pixel belong together
+_FILL_PX = 2  # holes between splatted points that are filled, in pixels of the strip
+_FULL_TEXTURE = 12.0  # grey levels, at which a match is as sure as it can be
+_WAVES_M = 0.15  # of the water about its plane, and of everything else that is not modelled
+_TEST_TEXTURE = 4.0  # grey levels, below which a match proves nothing about the water
+_TEST_BELOW_DEG = 0.6  # of elevation: higher up the plane is too far away
+_CLEARLY = 2.0  # standard deviations
+_UNDER_NATS, _OVER_NATS = 3.0, 1.5  # evidence of a point under and over the water
+
+
+@dataclass(frozen=True, eq=False)
+class DepthPanorama:
+    """range_m, sigma_m: (rows, columns) along the ray from the viewpoint, NaN where unknown. confidence: (rows,
+    columns) in 0..1. source: (rows, columns) uint8: 0 none, 1 water plane, 2 matched."""
+
+    grid: StripGrid
+    range_m: Array
+    sigma_m: Array
+    confidence: Array
+    source: NDArray[np.uint8]
+    timestamp_ns: int = 0
+
+    def inverse_horizontal(self) -> tuple[Array, Array]:
+        """(rows, columns) matched inverse horizontal distances and standard deviations for stixels, NaN elsewhere."""
+        cosine = np.cos(self.grid.elevations())[:, None]
+        matched = self.source == MATCHED
+        with np.errstate(invalid="ignore", divide="ignore"):
+            inverse = np.where(matched, 1 / (self.range_m * cosine), np.nan)
+            std = np.where(matched, self.sigma_m / (self.range_m**2 * cosine), np.nan)
+        return inverse, std
+
+    def surface(self, shell_m: float = SHELL_M) -> WaterAndDepth:
+        """As a surface that views can be drawn on."""
+        top, step = np.deg2rad(self.grid.top_deg), np.deg2rad(self.grid.step_deg)
+        return WaterAndDepth(self.range_m, float(top), float(step), shell_m)
+
+
+def measure_depth(
+    images: Mapping[str, Image],
+    rig: SurroundRig,
+    attitude: LevelAttitude,
+    labels: Labels,
+    grid: StripGrid,
+    masks: Mapping[str, Mask] | None = None,
+    nearest_m: float = 3.0,
+    timestamp_ns: int = 0,
+) -> DepthPanorama:
+    """Ranges of one frame set. labels: of its level strip: only obstacles are matched; the mirrored shore in the water
+    would be matched just as well, and be wrong."""
+    return fuse_depth(
+        matched_points(images, rig, attitude, masks, nearest_m), labels, grid, attitude, timestamp_ns
+    )
+
+
+def matched_points(
+    images: Mapping[str, Image],
+    rig: SurroundRig,
+    attitude: LevelAttitude,
+    masks: Mapping[str, Mask] | None = None,
+    nearest_m: float = 3.0,
+) -> list[MatchedPoints]:
+    """What every two cameras of a frame set see in common."""
+    found = [
+        match_pair(pair, images, rig, attitude, masks, nearest_m) for pair in epipolar_pairs(rig, attitude)
+    ]
+    return [points for points in found if points is not None]
+
+
+def tested_by_height(
+    labels: Labels, matched: Sequence[MatchedPoints], grid: StripGrid, attitude: LevelAttitude
+) -> Labels:
+    """Labels of a level strip, corrected where matched points lie clearly under or over the water plane.
+
+    What is under it is a mirror image, or glitter: water. What is over it stands on it. The second cue, independent of
+    what things look like; nothing changes where the height above the water is unknown.
+    """
+    if not (np.isfinite(attitude.height_m) and attitude.height_m > 0) or not matched:
+        return labels
+    inverse, std, texture, _ = _splatted(matched, grid)
+    down = np.sin(-grid.elevations())[:, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        range_m = 1 / inverse
+        height = attitude.height_m - range_m * down
+        range_std = std * range_m**2
+        uncertainty = np.sqrt(
+            (range_std * down) ** 2
+            + (range_m * attitude.tilt_std) ** 2
+            + attitude.height_std_m**2
+            + _WAVES_M**2
+        )
+        off = np.where(np.isfinite(height) & (texture > _TEST_TEXTURE), height / uncertainty, 0.0)
+    off = cv2.medianBlur(off.astype(np.float32), 3)
+    off[np.rad2deg(grid.elevations()) > -_TEST_BELOW_DEG] = 0
+    change = np.where(off < -_CLEARLY, -_UNDER_NATS, np.where(off > _CLEARLY, _OVER_NATS, 0.0))
+    logarithm = np.log(np.maximum(labels.probability, 1e-4))
+    logarithm[OBSTACLE] += change
+    each = np.exp(logarithm - logarithm.max(axis=0))
+    probability = (each / each.sum(axis=0)).astype(np.float32)
+    classes = np.where(labels.classes == NOT_SEEN, NOT_SEEN, probability.argmax(axis=0)).astype(np.uint8)
+    return Labels(classes, probability, labels.words)
+
+
+def fuse_depth(
+    matched: Sequence[MatchedPoints],
+    labels: Labels,
+    grid: StripGrid,
+    attitude: LevelAttitude,
+    timestamp_ns: int = 0,
+) -> DepthPanorama:
+    """Matched points of all pairs and the water plane in one panorama.
+
+    Of several ranges in a pixel the nearest group counts: what is farther is seen past it by another camera.
+    """
+    inverse, std, texture, hits = _splatted(matched, grid)
+    obstacle = labels.classes == OBSTACLE
+    known = np.isfinite(inverse) & obstacle
+    inverse, std, texture = _filled(inverse, std, texture, known, obstacle)
+    known = np.isfinite(inverse) & obstacle
+    rows, columns = grid.rows, grid.columns
+    range_m, sigma_m = np.full((rows, columns), np.nan), np.full((rows, columns), np.nan)
+    confidence, source = np.zeros((rows, columns)), np.zeros((rows, columns), np.uint8)
+    range_m[known] = 1 / inverse[known]
+    sigma_m[known] = std[known] / inverse[known] ** 2
+    relative = sigma_m[known] / range_m[known]
+    sure = np.clip(texture[known] / _FULL_TEXTURE, 0.05, 1) * np.where(hits[known] > 0, 1.0, 0.6)
+    confidence[known] = sure * np.exp(-2 * relative) * labels.probability[1][known]
+    source[known] = MATCHED
+    down = -np.sin(grid.elevations())
+    if np.isfinite(attitude.height_m) and attitude.height_m > 0:
+        water = (labels.classes == WATER) & (down > 1e-3)[:, None]
+        plane = np.broadcast_to((attitude.height_m / np.maximum(down, 1e-3))[:, None], water.shape)
+        slope = np.broadcast_to(
+            (1 / np.maximum(np.tan(np.arcsin(np.clip(down, 1e-3, 1))), 1e-3))[:, None], water.shape
+        )
+        relative_std = np.hypot(slope * attitude.tilt_std, attitude.height_std_m / attitude.height_m)
+        range_m[water], source[water] = plane[water], PLANE
+        sigma_m[water] = (plane * relative_std)[water]
+        confidence[water] = (np.exp(-2 * relative_std) * labels.probability[0])[water]
+    return DepthPanorama(grid, range_m, sigma_m, confidence, source, timestamp_ns)
+
+
+def _splatted(matched: Sequence[MatchedPoints], grid: StripGrid) -> tuple[Array, Array, Array, Array]:
+    """Inverse range, deviation, texture and number of points of every pixel (rows, columns)."""
+    size = grid.rows * grid.columns
+    inverse, std = np.full(size, np.nan), np.full(size, np.nan)
+    texture, hits = np.zeros(size), np.zeros(size)
+    if matched:
+        points = np.concatenate([m.points_level for m in matched])
+        deviation = np.concatenate([m.inverse_std for m in matched])
+        contrast = np.concatenate([m.texture for m in matched])
+        distance = np.linalg.norm(points, axis=1)
+        at = np.round(grid.pixels(points / distance[:, None])).astype(np.int64)
+        inside = (at[:, 1] >= 0) & (at[:, 1] < grid.rows)
+        pixel = (at[:, 1] * grid.columns + at[:, 0] % grid.columns)[inside]
+        value, deviation, contrast = 1 / distance[inside], deviation[inside], contrast[inside]
+        # the texture weighs: a foreground that bleeds over an edge has little of it there
+        weight = contrast / deviation**2
+        total = np.bincount(pixel, weight, size)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = np.bincount(pixel, weight * value, size) / total
+            near = np.abs(value - mean[pixel]) < _AGREE * deviation
+            total = np.bincount(pixel[near], weight[near], size)
+            inverse = np.bincount(pixel[near], (weight * value)[near], size) / total
+            std = np.bincount(pixel[near], (weight * deviation)[near], size) / total
+            texture = np.bincount(pixel[near], (weight * contrast)[near], size) / total
+        hits = np.bincount(pixel[near], minlength=size).astype(np.float64)
+    shape = (grid.rows, grid.columns)
+    return (
+        inverse.reshape(shape),
+        std.reshape(shape),
+        np.nan_to_num(texture).reshape(shape),
+        hits.reshape(shape),
+    )
+
+
+def _filled(
+    inverse: Array, std: Array, texture: Array, known: NDArray[np.bool_], wanted: NDArray[np.bool_]
+) -> tuple[Array, Array, Array]:
+    """Small holes filled with the mean around them, half as certain."""
+    size = (2 * _FILL_PX + 1, 2 * _FILL_PX + 1)
+    weight = cv2.blur(known.astype(np.float64), size)
+    hole = wanted & ~known & (weight > 0.25)
+    filled = []
+    for plane, factor in ((inverse, 1.0), (std, 2.0), (texture, 0.5)):
+        around = cv2.blur(np.where(known, plane, 0.0), size)
+        plane = np.where(known, plane, np.nan)
+        plane[hole] = factor * around[hole] / weight[hole]
+        filled.append(plane)
+    return filled[0], filled[1], filled[2]

@@ -1,0 +1,179 @@
+"""Stixels and ranges: exactness of the cut, ranges against a known world, honesty of their uncertainty."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from rigwake.errors import UsageError
+from rigwake.views.attitude import LevelAttitude
+from rigwake.views.depth import depth_panorama
+from rigwake.views.depth.depth_files import point_cloud
+from rigwake.views.depth.depth_panorama import MATCHED, PLANE, fuse_depth, matched_points
+from rigwake.views.depth.epipolar import MatchedPoints, epipolar_pairs
+from rigwake.views.scene.segmentation import Labels
+from rigwake.views.scene.stixel_files import world_to_dict
+from rigwake.views.scene.stixel_source import StixelEstimator, contact_shifts
+from rigwake.views.scene.stixel_world import cut_columns, find_stixels
+from rigwake.views.strips import StripGrid, level_strip
+from rigwake.views.surface import WaterAndShell
+from view_scenes import HEIGHT_M, attitude, four_cameras, photograph, water_and_ring
+
+RADIUS_M = 12.0
+GRID = StripGrid()
+
+
+def ring_labels(sure: float = 0.95) -> Labels:
+    """What the ring world shows from the viewpoint: water, a wall of 4 m height, sky."""
+    slope = np.tan(GRID.elevations())
+    height = HEIGHT_M + RADIUS_M * slope
+    row = np.where(height < 0, 0, np.where(height < 4.0, 1, 2))
+    classes = np.repeat(row[:, None], GRID.columns, axis=1).astype(np.uint8)
+    probability = np.full((3, *classes.shape), (1 - sure) / 2, np.float32)
+    for c in range(3):
+        probability[c][classes == c] = sure
+    return Labels(classes, probability)
+
+
+@pytest.fixture(scope="module")
+def seen():  # type: ignore[no-untyped-def]
+    rig, stand = four_cameras(), attitude(2.0, -1.0)
+    images = photograph(rig, stand, water_and_ring(RADIUS_M, is_mottled=True))
+    return rig, stand, images, matched_points(images, rig, stand)
+
+
+def cheapest_by_trying_all(cost: np.ndarray, horizon: int) -> float:
+    """The same cost model on a column of a few rows, over every cut there is."""
+    rows = cost.shape[1]
+    best = np.inf
+    for cuts in product((False, True), repeat=rows - 1):
+        edges = [0, *[k + 1 for k in range(rows - 1) if cuts[k]], rows]  # from the top
+        pieces = [(edges[k], edges[k + 1]) for k in range(len(edges) - 1)][::-1]  # from the bottom
+        for kinds in product(range(3), repeat=len(pieces)):
+            total, allowed, below = 0.0, True, -1
+            for (top, bottom), kind in zip(pieces, kinds, strict=True):
+                total += 5.0 + cost[kind, top:bottom].sum()
+                if kind == 0:
+                    allowed &= top >= horizon - 2 and below in (-1, 1)
+                    total += 3.0 if below == 1 else 0.0
+                elif kind == 2:
+                    allowed &= bottom <= horizon + 2 and below in (-1, 0, 1)
+                elif below == 2:
+                    total += 6.0
+                below = kind
+            if allowed:
+                best = min(best, total)
+    return best
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_cut_is_the_cheapest_of_all(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows, horizon = 7, 3
+    cost = rng.gamma(1.0, 6.0, (1, 3, rows))
+    none, far = np.zeros((1, rows)), np.ones((1, rows + 1))
+    count, cut = cut_columns(cost, none, none, far, far, np.array([rows]), np.array([0]), horizon)
+    pieces = cut[0, : count[0]]
+    total, below = 0.0, -1
+    for bottom, top, kind in pieces[:, :3].astype(int):
+        total += 5.0 + cost[0, kind, top:bottom].sum()
+        total += 3.0 if (kind, below) == (0, 1) else 6.0 if (kind, below) == (1, 2) else 0.0
+        below = kind
+    assert pieces[0, 0] == rows
+    assert pieces[-1, 1] == 0
+    assert total == pytest.approx(cheapest_by_trying_all(cost[0], horizon))
+
+
+def test_a_wall_in_the_water_has_its_distance() -> None:
+    world = find_stixels(ring_labels(), GRID, attitude())
+    wall = world.kind == 1
+    distance, std = world.range_m()
+    assert wall.sum() == GRID.columns
+    assert world.stands[wall].all()
+    assert np.abs(distance[wall] / RADIUS_M - 1).max() < 0.04  # half a row of 0.4 deg is 2.2 % here
+    assert (std[wall] > 0).all()
+    assert (np.abs(distance[wall] - RADIUS_M) < 3 * std[wall]).all()
+    assert np.allclose(world.free_range_m(), distance[wall])
+    surface = world.surface()
+    ahead = np.array([[np.cos(0.1), 0.0, np.sin(0.1)]])
+    assert surface.range_m(ahead, attitude())[0] == pytest.approx(RADIUS_M / np.cos(0.1), rel=0.05)
+
+
+def test_matches_make_ranges_better_and_one_line_of_json_is_complete(seen) -> None:  # type: ignore[no-untyped-def]
+    rig, stand, images, matched = seen
+    labels = ring_labels()
+    depth = fuse_depth(matched, labels, GRID, stand)
+    strip = level_strip(images, rig, stand, WaterAndShell(40.0), GRID)
+    shift = contact_shifts(labels, strip, images, rig, stand)
+    world = find_stixels(labels, GRID, stand, *depth.inverse_horizontal(), shift)
+    distance, _ = world.range_m()
+    wall = (world.kind == 1) & world.stands
+    assert np.median(np.abs(distance[wall] / RADIUS_M - 1)) < 0.01
+    line = world_to_dict(world)
+    assert len(line["obstacles"]) >= GRID.columns
+    assert len(line["free_water_m"]) == GRID.columns
+
+
+def test_ranges_of_two_cameras(seen) -> None:  # type: ignore[no-untyped-def]
+    rig, stand, images, matched = seen
+    assert len(epipolar_pairs(rig, stand)) >= 4
+    depth = fuse_depth(matched, ring_labels(), GRID, stand)
+    truth = np.broadcast_to((RADIUS_M / np.cos(GRID.elevations()))[:, None], depth.range_m.shape)
+    on_wall = depth.source == MATCHED
+    error = depth.range_m[on_wall] / truth[on_wall] - 1
+    assert np.median(np.abs(error)) < 0.02
+    assert (np.abs(error) > 0.1).mean() < 0.1
+    assert on_wall.sum() > 0.9 * (ring_labels().classes == 1).sum()
+    inverse_error = (1 / depth.range_m - 1 / truth)[on_wall] / (depth.sigma_m / depth.range_m**2)[on_wall]
+    assert np.median(inverse_error**2) / 0.455 < 2.0
+    cloud = point_cloud(depth, level_strip(images, rig, stand, WaterAndShell(40.0), GRID))
+    assert cloud.startswith(b"ply")
+    assert len(cloud) > 19 * on_wall.sum()
+
+
+def test_water_is_never_matched(seen) -> None:  # type: ignore[no-untyped-def]
+    _, stand, _, matched = seen
+    depth = fuse_depth(matched, ring_labels(), GRID, stand)
+    water = ring_labels().classes == 0
+    assert (depth.source[water] == PLANE).all()
+    plane = HEIGHT_M / np.sin(-GRID.elevations())
+    assert np.allclose(depth.range_m[150], plane[150])
+    nobody_knows = LevelAttitude(stand.level_from_rig)
+    assert np.isnan(fuse_depth(matched, ring_labels(), GRID, nobody_knows).range_m[water]).all()
+
+
+def test_what_lies_under_the_water_is_a_mirror_image() -> None:
+    stand = attitude()
+    labels = ring_labels(0.7)
+    row, columns = 100, np.arange(200, 260)  # 10 degrees down: water at 10.7 m
+    elevation = GRID.elevations()[row]
+    for range_m, wrong, right in ((30.0, 1, 0), (5.0, 0, 1)):
+        labels.classes[row - 2 : row + 3, 200:260] = wrong
+        labels.probability[:, row - 2 : row + 3, 200:260] = np.roll(
+            np.array([0.6, 0.2, 0.2], np.float32), wrong
+        )[:, None, None]
+        directions = np.concatenate([GRID.directions()[r, columns] for r in range(row - 2, row + 3)])
+        count = len(directions)
+        points = MatchedPoints(range_m * directions, np.full(count, 1e-3), np.full(count, 20.0), ("a", "b"))
+        corrected = depth_panorama.tested_by_height(labels, [points], GRID, stand)
+        assert (corrected.classes[row, 205:255] == right).all(), (
+            f"{np.rad2deg(elevation):.0f} deg, {range_m} m"
+        )
+    untouched = depth_panorama.tested_by_height(labels, [points], GRID, LevelAttitude(stand.level_from_rig))
+    assert untouched is labels
+
+
+def test_without_a_height_there_are_no_stixels() -> None:
+    with pytest.raises(UsageError, match="height"):
+        find_stixels(ring_labels(), GRID, LevelAttitude(np.eye(3)))
+
+
+def test_one_camera_alone_gives_stixels_and_nothing_is_matched() -> None:
+    rig, stand = four_cameras(), attitude()
+    images = {"front": photograph(rig, stand, water_and_ring(RADIUS_M))["front"]}
+    strip, labels, world = StixelEstimator(rig).estimate(images, stand, 0)
+    assert matched_points(images, rig, stand) == []
+    blind = ~strip.is_seen.any(axis=0)
+    assert blind.sum() > 200
+    assert not np.isin(world.column, np.flatnonzero(blind)).any()
+    assert np.isfinite(labels.probability).all()
