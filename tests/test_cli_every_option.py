@@ -114,6 +114,13 @@ USED = [
     ("intrinsics {corners} --output {here}/d.yaml", 2, "needs the image size"),
     ("evaluate {calibration} --truth {calibration} --gauge align --json {here}/e.json", 0, "next:"),
     ("evaluate {taken}/calibration.yaml --truth {calibration}", 0, "next:"),
+    (
+        "evaluate {port_tum} --truth {rig_tum} --alignment sim3 --max-difference 0.02 "
+        "--html {here}/t.html --json {here}/t.json",
+        0,
+        "ATE, RMS",
+    ),
+    ("evaluate {port_tum} --truth {port_tum}", 0, "next:"),
     ("diff {calibration} {calibration} --range 10 --range 50 --json {here}/d.json", 0, "at 50 m"),
     ("diff {calibration} {open}", 0, "next:"),
     *(

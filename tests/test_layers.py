@@ -46,6 +46,7 @@ LAYERS = [
     ["views"],
     ["fleet"],  # many recordings, on one machine or a cluster
     ["ros"],  # a node on board; imported by the command line alone
+    ["api"],
     ["cli", "__main__"],
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

@@ -8,43 +8,96 @@ calibration.camera("front").rig_from_cam.translation
 
 from __future__ import annotations
 
-from pathlib import Path
+import sys
+from importlib import import_module
+from inspect import Signature, signature
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from rigwake.kernel_cache import provide_kernel_cache
 
 if TYPE_CHECKING:
+    from rigwake.api import (
+        calibrate,
+        diff,
+        evaluate,
+        export,
+        handeye,
+        inspect,
+        intrinsics,
+        load_calibration,
+        monitor,
+        odometry,
+        open_recording,
+        report,
+        simulate,
+        undistort,
+    )
     from rigwake.calibration import Calibration
+    from rigwake.recording import Recording
+    from rigwake.trajectory import Trajectory
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "calibrate", "load_calibration"]
+__all__ = [
+    "Calibration",
+    "Recording",
+    "Trajectory",
+    "__version__",
+    "calibrate",
+    "diff",
+    "evaluate",
+    "export",
+    "handeye",
+    "inspect",
+    "intrinsics",
+    "load_calibration",
+    "monitor",
+    "odometry",
+    "open_recording",
+    "report",
+    "simulate",
+    "undistort",
+]
+_VALUES = {"Calibration": "calibration", "Recording": "recording", "Trajectory": "trajectory"}
+_ALSO_PACKAGES = ("handeye", "intrinsics", "monitor", "odometry", "report")
 
 provide_kernel_cache()  # before any module with compiled loops is imported
 
 
-def calibrate(
-    recording: Path | str,
-    out: Path | str = "rigwake-out",
-    *,
-    force: bool = False,
-    resume: bool = False,
-    **settings: Any,
-) -> Calibration:
-    """Find where every camera of a recording sits and looks; what `rigwake calibrate` does.
+class _CallablePackage(ModuleType):
+    """A package with the name of a verb: called, it does what the verb does (`rigwake.handeye(...)`)."""
 
-    out: folder for the result and what its stages leave; one that holds another result is refused unless `force`
-    (replace it) or `resume` (keep its finished stages). settings: fields of `rigwake.config.CalibrateConfig`
-    (`reference="front"`, `duration_s=60`). Cameras that failed are named in `checks["failed_cameras"]`.
-    Raises the errors of `rigwake.errors`, UnobservableError when the motion cannot tell.
-    """
-    from rigwake.config import load_config
-    from rigwake.pipeline.calibration_run import calibrate as run
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        return self._function()(*arguments, **options)
 
-    return run(recording, out, load_config(**settings), force=force, resume=resume).calibration
+    def _function(self) -> Any:
+        return getattr(import_module("rigwake.api"), self.__name__.rpartition(".")[2])
+
+    @property
+    def __signature__(self) -> Signature:
+        return signature(self._function())
 
 
-def load_calibration(path: Path | str) -> Calibration:
-    """Read a `calibration.yaml`."""
-    from rigwake.calibration import load_calibration as load
+class _Package(ModuleType):
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _ALSO_PACKAGES and isinstance(value, ModuleType):
+            value.__class__ = _CallablePackage
+        super().__setattr__(name, value)
 
-    return load(path)
+
+sys.modules[__name__].__class__ = _Package
+
+
+def __getattr__(name: str) -> Any:
+    """Functions and values of `__all__`, imported when they are first used."""
+    if name in _ALSO_PACKAGES:
+        return import_module(f"rigwake.{name}")
+    if name in _VALUES:
+        return getattr(import_module(f"rigwake.{_VALUES[name]}"), name)
+    if name in __all__:
+        return getattr(import_module("rigwake.api"), name)
+    raise AttributeError(f"module 'rigwake' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,27 +1,37 @@
-"""`rigwake evaluate`: a calibration against a known rig."""
+"""`rigwake evaluate`: a calibration against a known rig, or a trajectory against a known one."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from rich.markup import escape
 
 from rigwake.cli.console import figures_table, next_step, out, print_title, write_json
-from rigwake.cli.options import JsonOption, completed_from, require, require_there, require_writable
+from rigwake.cli.options import (
+    JsonOption,
+    completed_from,
+    require,
+    require_number,
+    require_there,
+    require_writable,
+)
+from rigwake.errors import UsageError
 
 if TYPE_CHECKING:
     from rigwake.evaluation.rig_errors import RigErrors
-    from rigwake.rig import Rig
+
+_ALIGNMENTS = ("auto", "se3", "sim3", "none")
 
 
 def command(
-    calibration: Annotated[Path, typer.Argument(help="A calibration, of any format that export writes.")],
+    calibration: Annotated[
+        Path, typer.Argument(help="A calibration of any format that export writes, or a trajectory.")
+    ],
     truth: Annotated[
-        Path, typer.Option("--truth", help="The known rig: a truth.yaml, or a calibration of any format.")
+        Path, typer.Option("--truth", help="The known rig (truth.yaml, any calibration) or trajectory.")
     ],
     gauge: Annotated[
         str,
@@ -37,34 +47,48 @@ def command(
             "(the rig's axes are forward-right-down), `left-handed`."
         ),
     ] = "enu",
+    alignment: Annotated[
+        str,
+        typer.Option(
+            help="Trajectories: fitted before the comparison: `se3`, `sim3` (with scale), `none`; `auto`: as metric.",
+            autocompletion=completed_from(_ALIGNMENTS),
+        ),
+    ] = "auto",
+    max_difference: Annotated[
+        float, typer.Option(help="Trajectories: stamps so many seconds apart belong together.")
+    ] = 0.01,
+    html: Annotated[Path | None, typer.Option(help="Trajectories: write one HTML page with plots.")] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Errors of a calibration against a known rig: degrees, metres, and how many of its own sigmas.
 
+    Of a trajectory against a known one: ATE, RPE and KITTI's errors.
+
     Example: [cyan]rigwake evaluate OUT/calibration.yaml --truth truth.yaml --json errors.json[/cyan]
+
+    Example: [cyan]rigwake evaluate found.tum --truth truth.tum --html page.html[/cyan]
     """
     require_there(calibration, truth)
     require("--gauge", gauge, ("reference", "align"))
+    require("--alignment", alignment, _ALIGNMENTS)
+    require_number("--max-difference", max_difference, above=0.0)
     require_writable("--json", json_file)
-    from rigwake.evaluation.rig_errors import evaluate_calibration
-    from rigwake.exporters import UNNAMED_FRAMES, read_calibration
-    from rigwake.exporters.export_base import refer_to_camera
+    require_writable("--html", html)
+    from rigwake.exporters.known_rig_errors import evaluate_against, is_trajectory_file
+
+    if is_trajectory_file(calibration):
+        _evaluate_trajectory(calibration, truth, frame, alignment, max_difference, html, json_file)
+        return
+    if html is not None:
+        raise UsageError(
+            "--html is for trajectories.", remedy="`rigwake report` makes the page of a calibration."
+        )
+    from rigwake.exporters import read_calibration
     from rigwake.exporters.known_rigs import read_known_rig, rig_in_house_frames
-    from rigwake.readers.truth_files import rig_in_frame
 
     found = read_calibration(calibration)
     rig = rig_in_house_frames(read_known_rig(truth), frame)
-    if found.reference in UNNAMED_FRAMES:
-        found = replace(found, reference=rig.reference)
-    elif rig.reference in UNNAMED_FRAMES:
-        rig = replace(rig, reference=found.reference)
-    elif gauge == "reference" and rig.reference in found.cameras and not _knows(rig, found.reference):
-        found = refer_to_camera(found, rig.reference)
-    errors = evaluate_calibration(
-        found,
-        rig_in_frame(rig, found.reference) if gauge == "reference" else rig,
-        gauge="align" if gauge == "align" else "reference",
-    )
+    found, errors = evaluate_against(found, rig, gauge="align" if gauge == "align" else "reference")
     if json_file is not None:
         write_json(json_file, errors.to_json())
         if str(json_file) == "-":
@@ -78,8 +102,46 @@ def command(
         )
 
 
-def _knows(rig: Rig, frame: str) -> bool:
-    return frame == rig.reference or frame in rig.cameras or (frame == "imu" and rig.rig_from_imu is not None)
+def _evaluate_trajectory(
+    found: Path,
+    truth: Path,
+    frame: str,
+    alignment: str,
+    max_difference_s: float,
+    html: Path | None,
+    json_file: Path | None,
+) -> None:
+    from rigwake.atomic import write_text_atomic
+    from rigwake.evaluation.trajectory_evaluation import evaluate_trajectory, usual_alignment
+    from rigwake.geometry.align import AlignmentKind
+    from rigwake.readers.trajectories import read_trajectory
+    from rigwake.report.trajectory_page import figures_in_words, trajectory_page
+
+    estimate = read_trajectory(found).trajectory
+    known = read_trajectory(truth, frame=frame).trajectory
+    fitted = usual_alignment(estimate) if alignment == "auto" else alignment
+    evaluation = evaluate_trajectory(
+        known,
+        estimate,
+        alignment=None if fitted == "none" else cast(AlignmentKind, fitted),
+        max_difference_s=max_difference_s,
+    )
+    if html is not None:
+        write_text_atomic(html, trajectory_page(evaluation, found.name, truth.name))
+    if json_file is not None:
+        write_json(json_file, evaluation.to_json())
+        if str(json_file) == "-":
+            return
+    table = figures_table(("figure", "value"))
+    for what, value in figures_in_words(evaluation):
+        table.add_row(what, value)
+    print_title(f"errors of {found.name} against {truth.name}")
+    out.print(table)
+    if html is not None:
+        out.print(f"written: {html}", markup=False, highlight=False)
+    else:
+        again = ["rigwake", "evaluate", found, "--truth", truth, "--frame", frame, "--alignment", alignment]
+        next_step([*again, "--max-difference", max_difference_s, "--html", "errors.html"], "see where")
 
 
 def _print(errors: RigErrors, title: str) -> None:

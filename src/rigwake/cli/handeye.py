@@ -80,31 +80,21 @@ def command(
     inputs = [_Input.parse(text) for text in (reference, *others)]
     require_there(*(one.path for one in inputs))
     from rigwake.calibration import save_calibration
-    from rigwake.errors import UnobservableError
     from rigwake.handeye.handeye_result import HandeyeOptions
-    from rigwake.handeye.joint_calibration import calibrate_handeye
-    from rigwake.handeye.one_body import in_one_unit
-    from rigwake.plausibility.handeye_fit import check_handeye, explain_failure
-    from rigwake.plausibility.values import checks_to_list, refuse
+    from rigwake.pipeline.handeye_run import run_handeye
+    from rigwake.plausibility.values import checks_to_list
 
     meanings = [_meaning(one, columns or (), frame or ()) for one in inputs]
     trajectories = [_read(one, *meaning) for one, meaning in zip(inputs, meanings, strict=True)]
-    for at, member in enumerate(trajectories[1:], start=1):
-        trajectories[at], noticed = in_one_unit(trajectories[0], member)
-        if noticed is not None:
-            err.print(f"[yellow]{escape(noticed.message)}[/yellow]")
     options = HandeyeOptions(
         method="thesis" if method in ("thesis", "seed") else "ml",
         noise=None if noise == "auto" else noise,  # type: ignore[arg-type]
         time_offset=time_offset,
         scale=scale,
     )
-    try:
-        result = calibrate_handeye(trajectories[0], trajectories[1:], options)
-    except UnobservableError as error:
-        raise explain_failure(trajectories[0], trajectories[1:], error, options) from error
-    checks = check_handeye(trajectories[0], trajectories[1:], result, options) if method == "ml" else ()
-    refuse(checks, "No calibration is made from it.")
+    result, checks, noticed = run_handeye(trajectories[0], trajectories[1:], options)
+    for finding in noticed:
+        err.print(f"[yellow]{escape(finding.message)}[/yellow]")
     if output is not None:
         provenance = {
             "command": "handeye",

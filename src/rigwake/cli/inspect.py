@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,8 +25,6 @@ if TYPE_CHECKING:
     from rigwake.inspection.readiness import Readiness
     from rigwake.inspection.recording_inspection import Inspection
     from rigwake.inspection.time_offsets import SensorTimeOffset
-    from rigwake.plausibility.values import SensorCheck
-    from rigwake.recording import Recording
 
 _COLOURS = {"enough": "green", "partly": "yellow", "not enough": "red"}
 _SEVERITIES = {"note": "dim", "warning": "yellow", "error": "red"}
@@ -55,25 +52,19 @@ def command(
     require_writable("--html", html)
     from rigwake.inspection.inspection_page import inspection_page
     from rigwake.inspection.inspection_summary import inspection_to_dict
-    from rigwake.inspection.readiness import judge
-    from rigwake.inspection.recording_inspection import inspect_recording
+    from rigwake.pipeline.checked_inspection import inspect_with_checks
     from rigwake.plausibility.values import checks_to_list
     from rigwake.readers.open import open_recording
     from rigwake.readers.topics import TopicMap
-    from rigwake.recording import Finding
 
     opened = open_recording(recording, TopicMap.from_options(topic or (), topics, camera_file or ()))
     with progress_bar() as bar:
         task = bar.add_task("reading", total=1)
-        inspection = inspect_recording(
+        inspection, verdict, checks = inspect_with_checks(
             opened,
             lambda text, done, total: bar.update(task, description=escape(text), completed=done, total=total),
         )
-    checks = _sensor_checks(opened)
     wrong = [check for check in checks if not check.agrees]
-    named = tuple(Finding("error", check.sensor, f"{check.hypothesis} {check.remedy}") for check in wrong)
-    inspection = replace(inspection, findings=(*inspection.findings, *named))
-    verdict = judge(inspection)
     if json_file is not None:
         write_json(
             json_file, inspection_to_dict(inspection, verdict) | {"sensor_checks": checks_to_list(checks)}
@@ -92,17 +83,6 @@ def command(
             next_step(["rigwake", "inspect", recording, *given, *page], "see why, then record as advised")
     if wrong:
         raise typer.Exit(1)
-
-
-def _sensor_checks(recording: Recording) -> tuple[SensorCheck, ...]:
-    """The first IMU that has enough samples: its units and axes, alone and against the cameras' coarse turns."""
-    from rigwake.inspection.recording_inspection import MIN_MOTION_SAMPLES
-    from rigwake.pipeline.sensor_checks import imu_checks
-
-    imu = next((i for i in recording.imus.values() if len(i.gyro) >= MIN_MOTION_SAMPLES), None)
-    if imu is None:
-        return ()
-    return imu_checks(imu, {n: c for n, c in recording.cameras.items() if c.model is not None})
 
 
 def _print(inspection: Inspection, verdict: Readiness) -> None:

@@ -189,14 +189,13 @@ def _stereo(
 ) -> None:
     """The path of the first of two cameras in metres, by their known baseline."""
     from rigwake.exporters.known_rigs import read_known_rig
-    from rigwake.pipeline.odometry_run import run_stereo
-    from rigwake.pipeline.out_folder import check_camera_names
+    from rigwake.pipeline.odometry_run import run_stereo, stereo_pair
     from rigwake.writers.trajectory_writer import write_tum
 
     names = [name.strip() for name in stereo.split(",") if name.strip()]
-    check_camera_names(names)
+    first, second = stereo_pair(opened, names)
     known = opened.true_rig if rig == opened.path and opened.true_rig is not None else read_known_rig(rig)
-    found = run_stereo(opened, names, known, options)
+    found = run_stereo(first, second, known, options)
     file = output / f"{names[0]}.tum"
     write_tum(found, file)
     if json_file is not None:

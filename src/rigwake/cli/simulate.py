@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.markup import escape
 
 from rigwake.cli.console import next_step, out, progress_bar
 from rigwake.cli.options import PRESETS, completed_from, require_number, require_writable
-from rigwake.errors import UsageError
-
-if TYPE_CHECKING:
-    from rigwake.recording import Finding, Recording
-    from rigwake.simulation.scenario import Scenario
+from rigwake.simulation.recording_target import require_recording_target
 
 
 def command(
@@ -51,10 +46,11 @@ def command(
     """
     require_number("--duration", duration, above=0.0)
     if not show:
-        _check_target(output)
-    from rigwake.simulation.scenario import load_scenario
+        require_recording_target(output)
+        require_writable("-o", output, folder=output is not None and output.suffix == "")
+    from rigwake.simulation.scenario import changed_scenario, load_scenario
 
-    chosen = _changed(load_scenario(scenario), duration, seed)
+    chosen = changed_scenario(load_scenario(scenario), duration, seed)
     if show:
         import yaml
 
@@ -62,7 +58,19 @@ def command(
         return
     assert output is not None
     truth_folder = output.parent / f"{output.stem}_truth"
-    recording, findings = _record(chosen, output, truth_folder, workers, truth_images)
+    from rigwake.simulation.write_simulation import write_simulation
+
+    with progress_bar() as bar:
+        task = bar.add_task("building the scene (compiles the first time)", total=1)
+        recording, findings = write_simulation(
+            chosen,
+            output,
+            workers=workers,
+            truth_images=truth_images,
+            progress=lambda text, done, total: bar.update(
+                task, description=escape(text), completed=done, total=total
+            ),
+        )
     frames = sum(len(camera) for camera in recording.cameras.values())
     out.print(
         f"{escape(str(output))}: {len(recording.cameras)} cameras, {frames} frames, {chosen.duration_s:g} s."
@@ -71,56 +79,3 @@ def command(
     for finding in findings:
         out.print(f"[dim]{escape(finding.sensor)}: {escape(finding.message)}[/dim]")
     next_step(["rigwake", "inspect", output], "see what was recorded")
-
-
-_SUFFIXES = (".bag", ".mcap", "")  # others are more likely a slip than the name of a folder
-
-
-def _check_target(output: Path | None) -> None:
-    """Raises UsageError for a recording that could not be written after it was rendered."""
-    if output is None:
-        raise UsageError("Where to? -o names the recording.", remedy="For example: -o harbour.bag")
-    if os.path.lexists(output):
-        raise UsageError(f"{output} is already there.", remedy="Remove it, or choose another name.")
-    if output.suffix not in _SUFFIXES:
-        raise UsageError(
-            f"-o {output}: no recording has the suffix {output.suffix}.",
-            remedy=f"-o {output.stem}.bag (ROS 1), {output.stem}.mcap (ROS 2), or {output.stem} (a folder).",
-        )
-    require_writable("-o", output, folder=output.suffix == "")
-
-
-def _record(
-    scenario: Scenario, output: Path, truth_folder: Path, workers: int, truth_images: bool
-) -> tuple[Recording, tuple[Finding, ...]]:
-    """Render and write everything, with a progress bar; what was rendered survives an interruption."""
-    from rigwake.simulation.record import build_world, render_recording, work_folder
-    from rigwake.simulation.setup import prepare
-    from rigwake.simulation.truth_writer import write_truth, write_truth_images
-    from rigwake.writers.write import write_recording
-
-    simulation = prepare(scenario)
-    work = work_folder(output, scenario)
-    with progress_bar() as bar:
-        task = bar.add_task("building the scene (compiles the first time)", total=1)
-
-        def show_progress(text: str, done: int, total: int) -> None:
-            bar.update(task, description=escape(text), completed=done, total=total)
-
-        scenery, renderer = build_world(simulation)
-        recording = render_recording(simulation, renderer, work, workers=workers, progress=show_progress)
-        show_progress("writing", 0, 1)
-        findings = write_recording(recording, output)
-        write_truth(simulation, scenery.known_points_world, truth_folder)
-        if truth_images:
-            write_truth_images(simulation, renderer, truth_folder, show_progress)
-    shutil.rmtree(work)
-    return recording, findings
-
-
-def _changed(scenario: Scenario, duration: float | None, seed: int | None) -> Scenario:
-    from rigwake.simulation.scenario import build_scenario
-
-    changes = {"duration_s": duration, "seed": seed}
-    given = {key: value for key, value in changes.items() if value is not None}
-    return build_scenario(scenario.model_dump() | given, scenario.name) if given else scenario

@@ -9,7 +9,6 @@ import typer
 
 from rigwake.cli.console import next_step, out, progress_bar
 from rigwake.cli.options import require, require_there, require_writable
-from rigwake.errors import UsageError
 
 
 def command(
@@ -34,50 +33,22 @@ def command(
 
     Example: [cyan]rigwake undistort sail.bag --camera front --every 10 -o OUT[/cyan]
     """
-    from rigwake.cameras.formats.camera_files import read_camera
-    from rigwake.pipeline.undistortion import Target, prepare_undistortion, undistort_files, undistort_stream
-    from rigwake.readers.open import open_recording
-    from rigwake.readers.picture_files import IMAGE_SUFFIXES
+    from rigwake.pipeline.undistortion import Target, undistort_source
 
     require("--to", to, get_args(Target))
     require_there(*source, camera_file)
     require_writable("--out", output, folder=True)
-    target = cast(Target, to)
-    given = None if camera_file is None else read_camera(camera_file, camera)
     with progress_bar() as bar:
         task = bar.add_task("undistorting", total=1)
-
-        def show(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
-        if all(path.suffix.lower() in IMAGE_SUFFIXES for path in source) or (given and _only_images(source)):
-            if given is None:
-                raise UsageError(
-                    "Images alone do not say what the lens is.", remedy="Give --camera-file FILE."
-                )
-            written = undistort_files(source, prepare_undistortion(given, target, focal), output, show)
-        else:
-            if len(source) != 1:
-                raise UsageError("Give one recording, or images.")
-            recording = open_recording(source[0])
-            stream = recording.camera(camera) if camera else next(iter(recording.cameras.values()), None)
-            if stream is None:
-                raise UsageError(f"{source[0]} has no camera.", remedy=f"rigwake inspect {source[0]}")
-            model = given or stream.model
-            if model is None:
-                raise UsageError(
-                    f"{source[0]} does not say what the lens of {stream.name} is.",
-                    remedy="Give --camera-file FILE.",
-                )
-            written = undistort_stream(
-                stream, prepare_undistortion(model, target, focal), output, every, show
-            )
+        written = undistort_source(
+            source,
+            output,
+            camera_file=camera_file,
+            camera=camera,
+            target=cast(Target, to),
+            focal_px=focal,
+            every=every,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
     out.print(f"{len(written)} files in {output}", markup=False, highlight=False)
     next_step("rigwake undistort --help", "other views: --to cylinder, --to equirectangular, --focal")
-
-
-def _only_images(source: list[Path]) -> bool:
-    """Whether folders hold images and nothing that makes them a recording."""
-    from rigwake.readers.image_files import image_files
-
-    return all(path.is_file() or (path.is_dir() and bool(image_files(path))) for path in source)

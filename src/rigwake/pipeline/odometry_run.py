@@ -116,18 +116,26 @@ def run_odometry(
     return run
 
 
+def stereo_pair(opened: Recording, names: Sequence[str]) -> tuple[CameraStream, CameraStream]:
+    """Two cameras of a recording. Raises UsageError unless two different ones are named."""
+    if len(names) != 2 or names[0] == names[1]:
+        raise UsageError(
+            f"Stereo odometry needs two cameras, not {', '.join(names) or 'none'}.",
+            remedy="As in --stereo left,right.",
+        )
+    check_camera_names(names)
+    return opened.camera(names[0]), opened.camera(names[1])
+
+
 def run_stereo(
-    opened: Recording, names: Sequence[str], rig: Rig, options: CameraOdometryOptions
+    first: CameraStream, second: CameraStream, rig: Rig, options: CameraOdometryOptions
 ) -> Trajectory:
     """Metric trajectory of the first of two synchronised cameras whose places on the rig are known.
 
-    Raises UsageError unless two different cameras of the recording and of the rig are named, or without intrinsics or
-    common stamps; EstimationError where a frame sees too few points in both cameras.
+    Raises UsageError where the rig lacks one of them, without intrinsics or common stamps; EstimationError where a
+    frame sees too few points in both cameras.
     """
-    if len(names) != 2 or names[0] == names[1]:
-        raise UsageError(f"Stereo odometry needs two cameras, not {', '.join(names)}.", remedy="left,right")
-    first, second = (opened.camera(name) for name in names)
-    rig_from_first, rig_from_second = (rig.camera(name).rig_from_cam for name in names)
+    rig_from_first, rig_from_second = (rig.camera(s.name).rig_from_cam for s in (first, second))
     if first.model is None or second.model is None:
         raise UsageError("Stereo odometry needs the intrinsics of both cameras.")
     tracks = track_camera(first, options=options.tracking)

@@ -12,7 +12,7 @@ import numpy as np
 
 from rigwake._types import Image
 from rigwake.atomic import atomic_path
-from rigwake.cameras.formats.camera_files import write_cameras
+from rigwake.cameras.formats.camera_files import read_camera, write_cameras
 from rigwake.cameras.models.lens import axis_focal_px
 from rigwake.cameras.models.pinhole import Pinhole
 from rigwake.cameras.protocol import CameraModel
@@ -27,7 +27,9 @@ from rigwake.cameras.virtual_views import (
 from rigwake.errors import InputError, UsageError
 from rigwake.readers.image_files import image_files, read_bytes
 from rigwake.readers.images import decode_compressed
-from rigwake.recording import CameraStream
+from rigwake.readers.open import open_recording
+from rigwake.readers.picture_files import IMAGE_SUFFIXES
+from rigwake.recording import CameraStream, Recording
 
 Target = Literal["pinhole", "cylinder", "equirectangular"]
 _MAX_VERTICAL_FOV = np.deg2rad(150.0)  # a cylinder is endless towards its poles
@@ -84,6 +86,50 @@ def _require_size(width_px: int, height_px: int) -> None:
             f"The view would be {width_px} x {height_px} pixels.",
             remedy=f"Choose --focal so that both sides lie between 2 and {_MAX_SIZE_PX}.",
         )
+
+
+def undistort_source(
+    source: Sequence[Path] | Recording,
+    out: Path,
+    *,
+    camera_file: Path | None = None,
+    camera: str | None = None,
+    target: Target = "pinhole",
+    focal_px: float | None = None,
+    every: int = 1,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Path]:
+    """Undistort images, folders of images, or one camera of a recording; returns the files written.
+
+    camera_file: the lens, by default the recording's. camera: its name in the file or the recording. every: of a
+    recording, every n-th frame. Raises UsageError where the lens or the camera is not known.
+    """
+    given = None if camera_file is None else read_camera(camera_file, camera)
+    if not isinstance(source, Recording):
+        if all(path.suffix.lower() in IMAGE_SUFFIXES for path in source) or (given and _only_images(source)):
+            if given is None:
+                raise UsageError(
+                    "Images alone do not say what the lens is.", remedy="Give --camera-file FILE."
+                )
+            return undistort_files(source, prepare_undistortion(given, target, focal_px), out, progress)
+        if len(source) != 1:
+            raise UsageError("Give one recording, or images.")
+        source = open_recording(source[0])
+    stream = source.camera(camera) if camera else next(iter(source.cameras.values()), None)
+    if stream is None:
+        raise UsageError(f"{source.path} has no camera.", remedy=f"rigwake inspect {source.path}")
+    model = given or stream.model
+    if model is None:
+        raise UsageError(
+            f"{source.path} does not say what the lens of {stream.name} is.",
+            remedy="Give --camera-file FILE.",
+        )
+    return undistort_stream(stream, prepare_undistortion(model, target, focal_px), out, every, progress)
+
+
+def _only_images(source: Sequence[Path]) -> bool:
+    """Whether folders hold images and nothing that makes them a recording."""
+    return all(path.is_file() or (path.is_dir() and bool(image_files(path))) for path in source)
 
 
 def undistort_files(

@@ -310,6 +310,13 @@ def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
+def changed_scenario(scenario: Scenario, duration_s: float | None, seed: int | None) -> Scenario:
+    """The scenario with another duration or random seed, where they are given."""
+    changes = {"duration_s": duration_s, "seed": seed}
+    given = {key: value for key, value in changes.items() if value is not None}
+    return build_scenario(scenario.model_dump() | given, scenario.name) if given else scenario
+
+
 def build_scenario(document: Any, origin: str = "scenario") -> Scenario:
     """A scenario from a plain mapping; UsageError lists every field that is wrong."""
     try:

@@ -1,0 +1,35 @@
+"""Hand-eye calibration with the checks around it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rigwake.errors import UnobservableError
+from rigwake.handeye.handeye_result import HandeyeOptions, HandeyeResult
+from rigwake.handeye.joint_calibration import calibrate_handeye
+from rigwake.handeye.one_body import in_one_unit
+from rigwake.plausibility.handeye_fit import check_handeye, explain_failure
+from rigwake.plausibility.values import SensorCheck, refuse
+from rigwake.recording import Finding
+from rigwake.trajectory import Trajectory
+
+
+def run_handeye(
+    reference: Trajectory, others: Sequence[Trajectory], options: HandeyeOptions
+) -> tuple[HandeyeResult, tuple[SensorCheck, ...], tuple[Finding, ...]]:
+    """The rig, how well each trajectory agrees with it, and what was noticed about units.
+
+    Raises UnobservableError when they did not move enough, InputError where a trajectory contradicts the others.
+    """
+    members, noticed = [], []
+    for other in others:
+        member, finding = in_one_unit(reference, other)
+        members.append(member)
+        noticed += [] if finding is None else [finding]
+    try:
+        result = calibrate_handeye(reference, members, options)
+    except UnobservableError as error:
+        raise explain_failure(reference, members, error, options) from error
+    checks = tuple(check_handeye(reference, members, result, options)) if options.method == "ml" else ()
+    refuse(checks, "No calibration is made from it.")
+    return result, checks, tuple(noticed)
