@@ -425,15 +425,33 @@ def simulate(
 
 
 def monitor(
-    calibration: FilePath | Calibration, recording: FilePath | Recording, *, progress: Progress = _silent
+    calibration: FilePath | Calibration,
+    recording: FilePath | Recording,
+    *,
+    out: FilePath | None = None,
+    log: FilePath | None = None,
+    progress: Progress = _silent,
 ) -> MonitorResult:
     """Has a camera moved since it was calibrated, or during this recording? `result.verdicts` by camera.
 
-    Raises InputError where the recording is not of the calibrated vessel, UnobservableError where it is too short.
+    out: folder for monitor.html and monitor.json. log: logbook that the verdicts go into. Raises InputError where the
+    recording is not of the calibrated vessel, UnobservableError where it is too short.
     """
+    from rigwake.monitor.kept_result import keep_result
     from rigwake.monitor.run import monitor as run
 
-    return run(_calibration(calibration), _opened(recording), progress)
+    calibrated, opened = _calibration(calibration), _opened(recording)
+    result = run(calibrated, opened, progress)
+    note = Path(calibration).name if isinstance(calibration, str | Path) else ""
+    keep_result(
+        calibrated,
+        opened,
+        result,
+        None if out is None else Path(out),
+        None if log is None else Path(log),
+        note=note,
+    )
+    return result
 
 
 def _topic_map(

@@ -53,8 +53,8 @@ def command(
     require_writable("--json", json_file)
     from rigwake.calibration import load_calibration
     from rigwake.logbook.store import Logbook
-    from rigwake.monitor.monitor_page import write_page
-    from rigwake.monitor.monitor_report import logged_verdicts, result_to_dict, verdict_line
+    from rigwake.monitor.kept_result import keep_result
+    from rigwake.monitor.monitor_report import result_to_dict, verdict_line
     from rigwake.monitor.run import monitor
     from rigwake.readers.open import open_recording
     from rigwake.readers.topics import TopicMap
@@ -66,18 +66,9 @@ def command(
     opened = open_recording(recording, TopicMap.from_options(topic or (), topics, camera_file or ()))
     with progress_bars() as bars:
         result = monitor(calibrated, opened, bars)
-    content = result_to_dict(result)
     if json_file is not None:
-        write_json(json_file, content)
-    if out_folder is not None:
-        write_json(out_folder / "monitor.json", content)
-        write_page(result, opened, out_folder / "monitor.html")
-    if log is not None:
-        with Logbook(log, create=True) as book:
-            number = book.find(calibrated)
-            if number is None:
-                number = book.add(calibrated, _valid_from(calibrated, opened), note=calibration.name)
-            book.add_verdicts(number, logged_verdicts(result, recording))
+        write_json(json_file, result_to_dict(result))
+    keep_result(calibrated, opened, result, out_folder, log, note=calibration.name)
     if str(json_file) != "-":
         for verdict in result.verdicts.values():
             line = verdict_line(verdict, f"rigwake recalibrate {calibration} {recording} -o NEW.yaml")
@@ -100,8 +91,3 @@ def command(
             next_step(["rigwake", "log", "--help"], "keep a history: monitor with --log VESSEL.db")
     if result.exit_code:
         raise typer.Exit(result.exit_code)
-
-
-def _valid_from(calibrated, opened) -> int:  # type: ignore[no-untyped-def]
-    """A calibration that was never logged holds from this recording on, as far as the logbook knows."""
-    return min(int(camera.timestamps_ns[0]) for camera in opened.cameras.values() if len(camera))

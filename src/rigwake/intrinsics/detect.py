@@ -16,11 +16,11 @@ from rigwake._types import Array
 from rigwake.errors import EstimationError, UsageError
 from rigwake.intrinsics.board_observations import MIN_CORNERS, BoardObservations, BoardView, gathered
 from rigwake.intrinsics.boards import Board
+from rigwake.readers.picture_files import IMAGE_SUFFIXES
 
 Grey = NDArray[np.uint8]
 Found = tuple[NDArray[np.int64], Array]  # corner ids and pixels
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
 _SUBPIXEL_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
 _SMALLEST_TAG_PX = 12.0  # below, the window of the refinement would hold more than one corner
 _BORDER_BITS = (2, 1)  # Kalibr prints its tags with a border of two bits, AprilTag's own have one
@@ -136,7 +136,9 @@ def list_images(paths: Iterable[Path]) -> list[Path]:
         else:
             raise UsageError(f"{path} is neither a file nor a folder.")
     if not files:
-        raise UsageError("There are no images.", remedy=f"Known suffixes: {', '.join(IMAGE_SUFFIXES)}.")
+        raise UsageError(
+            "There are no images.", remedy=f"Known suffixes: {', '.join(sorted(IMAGE_SUFFIXES))}."
+        )
     return files
 
 
