@@ -12,6 +12,7 @@ import numpy as np
 from rigwake._types import Image
 from rigwake.errors import InputError
 from rigwake.readers.images import ImageSize, checked_size, compressed_size, decode_compressed
+from rigwake.readers.pixel_encodings import depth_of_sensor
 
 IMAGE_SUFFIXES = frozenset(
     {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".webp"}
@@ -120,7 +121,7 @@ def bits_in_use(pictures: Iterable[bytes]) -> int:
             continue
         if image.dtype == np.uint16:
             largest = max(largest, int(np.percentile(image, 99.99)))
-    return next((bits for bits in (10, 12, 14, 16) if largest < 1 << bits), 16) if largest else 0
+    return depth_of_sensor(largest) if largest else 0
 
 
 def _check_whole(encoded: bytes) -> None:

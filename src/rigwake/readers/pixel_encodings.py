@@ -124,7 +124,12 @@ def bits_in_use(pixels: Buffer, *, big_endian: bool) -> int:
         return 16
     keep = len(samples) - 1 - len(samples) // 1_000_000
     largest = int(np.partition(samples, keep)[keep])
-    return next((bits for bits in (8, 10, 12, 14) if largest < 1 << bits), 16)
+    return depth_of_sensor(largest, least=8)
+
+
+def depth_of_sensor(largest: int, *, least: int = 10) -> int:
+    """Bits of the sensor whose largest sample is this: one of 8, 10, 12, 14, 16, and at least `least`."""
+    return next((bits for bits in (8, 10, 12, 14) if bits >= least and largest < 1 << bits), 16)
 
 
 def decode_pixels(
