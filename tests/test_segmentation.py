@@ -14,7 +14,7 @@ from rigwake.errors import EstimationError, InputError, UsageError
 from rigwake.views.attitude import LevelAttitude
 from rigwake.views.scene.colour_method import ColourClassifier
 from rigwake.views.scene.label_measures import LabelComparison, flat_horizon, water_edge_rows
-from rigwake.views.scene.network import foreign_network, network_input, shipped_network
+from rigwake.views.scene.network import external_network, network_input, shipped_network
 from rigwake.views.scene.segmentation import SmoothedLabels, segment_image, segment_strip, turned_columns
 from rigwake.views.strips import LevelStrip, StripGrid
 from river_labels import HORIZON_ROW, UNTOUCHED, river_truth
@@ -110,30 +110,30 @@ def test_a_dark_picture_says_so_and_is_less_sure() -> None:
     assert labels.mean_confidence < 0.7
 
 
-def test_foreign_networks(tmp_path: Path) -> None:
+def test_external_networks(tmp_path: Path) -> None:
     image = np.full((50, 70, 3), 90, np.uint8)
     good = tmp_path / "good.onnx"
     good.write_bytes(constant_network([0.0, 3.0, 1.0]))
-    found = segment_image(image, foreign_network(good, ("obstacle", "water", "sky")))
+    found = segment_image(image, external_network(good, ("obstacle", "water", "sky")))
     assert (found.classes == 0).all()
-    found = segment_image(image, foreign_network(good, ("water", "other", "obstacle")))
+    found = segment_image(image, external_network(good, ("water", "other", "obstacle")))
     assert (found.classes == 1).all()
     with pytest.raises(InputError, match="classes"):
-        segment_image(image, foreign_network(good, ("obstacle", "water")))
+        segment_image(image, external_network(good, ("obstacle", "water")))
     with pytest.raises(UsageError, match="water"):
-        foreign_network(good, ("obstacle", "sea", "sky"))
+        external_network(good, ("obstacle", "sea", "sky"))
     bad = tmp_path / "infinite.onnx"
     bad.write_bytes(constant_network([np.inf, 3.0, 1.0]))
     with pytest.raises(EstimationError, match="not numbers"):
-        segment_image(image, foreign_network(bad, ("obstacle", "water", "sky")))
+        segment_image(image, external_network(bad, ("obstacle", "water", "sky")))
     four = tmp_path / "four.onnx"
     four.write_bytes(one_layer(4, 3))
     with pytest.raises(InputError, match="does not take"):
-        segment_image(image, foreign_network(four, ("obstacle", "water", "sky")))
+        segment_image(image, external_network(four, ("obstacle", "water", "sky")))
     text = tmp_path / "text.onnx"
     text.write_bytes(b"this is no network")
     with pytest.raises(InputError, match="cannot be read"):
-        foreign_network(text, ("obstacle", "water", "sky"))
+        external_network(text, ("obstacle", "water", "sky"))
 
 
 def test_measures_count_what_stands_below_the_horizon() -> None:

@@ -15,6 +15,7 @@ from rigwake.recording import GnssStream
 from rigwake.trajectory import Trajectory
 
 _DRIFT = 0.01  # of the path: what a camera's own path may be off
+_DRIFT_WITHOUT_IMU = 0.12  # the same of vision alone, whose scale and heading wander
 _STDS = 4.0
 _CLEARLY_BETTER = 0.35
 _DELAY_S, _DELAY_SIGMAS = 0.05, 4.0
@@ -61,7 +62,7 @@ def vet_receiver(
         fit = fit_receiver(path, gnss, gnss.position_enu, time_offset_s=time_offset_s)
     except UnobservableError as error:
         return VettedReceiver(gnss, 0.0, None, (*checks, SensorCheck(sensor, True, 0.0, 0.0, error.cause)))
-    expected = _expected(gnss, fit)
+    expected = _expected(gnss, fit, level)
     quantity = "horizontal distance of fixes to the cameras' path, m"
     if fit.rms > expected:
         words, remedy = _confusion(gnss, path, time_offset_s, fit) if level else ("", "")
@@ -95,10 +96,13 @@ def vet_receiver(
     return VettedReceiver(gnss, fit.lag_s if late else 0.0, fit, tuple(checks))
 
 
-def _expected(gnss: GnssStream, fit: ReceiverFit) -> float:
-    """Horizontal distance per axis that the stated covariance and the drift of a camera's path allow, metres."""
+def _expected(gnss: GnssStream, fit: ReceiverFit, level: bool) -> float:
+    """Horizontal distance per axis that the stated covariance and the drift of a camera's path allow, metres.
+
+    Without an IMU (not `level`) a camera's rotations and scale drift as well.
+    """
     stated = float(np.sqrt(np.median(gnss.covariances[:, [0, 1], [0, 1]])))
-    return _STDS * stated + _DRIFT * fit.path_m + 0.1
+    return _STDS * stated + (_DRIFT if level else _DRIFT_WITHOUT_IMU) * fit.path_m + 0.1
 
 
 def _confusion(

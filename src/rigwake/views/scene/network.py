@@ -115,7 +115,7 @@ def shipped_network() -> SegmentationNetwork:
     return SegmentationNetwork(SHIPPED, CLASSES, True, _read(content, SHIPPED))
 
 
-def foreign_network(path: Path, classes: Sequence[str]) -> SegmentationNetwork:
+def external_network(path: Path, classes: Sequence[str]) -> SegmentationNetwork:
     """Any semantic segmentation as an ONNX file: input (1, 3, H, W) RGB normalised as for ImageNet, output
     (1, len(classes), h, w). Raises InputError, or UsageError for wrong class names."""
     known = {*CLASSES, "other"}

@@ -28,7 +28,7 @@ from rigwake.views.scene.label_measures import (
     flat_horizon,
     water_edge_rows,
 )
-from rigwake.views.scene.network import foreign_network, shipped_network
+from rigwake.views.scene.network import external_network, shipped_network
 from rigwake.views.scene.segmentation import (
     Labels,
     PixelClassifier,
@@ -59,7 +59,7 @@ class SegmentChoices:
         """The network or the colour method."""
         if self.method == "colour":
             return ColourClassifier()
-        return shipped_network() if self.onnx is None else foreign_network(self.onnx, self.classes)
+        return shipped_network() if self.onnx is None else external_network(self.onnx, self.classes)
 
 
 @dataclass(frozen=True, eq=False)
