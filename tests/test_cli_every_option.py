@@ -60,7 +60,7 @@ USED = [
         "",
     ),
     (
-        "odometry {images} --out {here}/o2 --camera front --imu --gnss --attitude --hull --horizon --refine-lens",
+        "odometry {images} --out {here}/o2 --camera front --imu --gnss --attitude --hull --horizon on --refine-lens",
         1,
         "no frames",
     ),
@@ -144,6 +144,32 @@ USED = [
     ("simulate {list} -o {here}/s.bag --jobs 1 --workers 1 --truth-images --no-show", 2, "list.yaml"),
     ("simulate demo --out {here}/s.xyz", 2, "suffix"),
     ("simulate demo --output {here}/s.xyz", 2, "suffix"),
+    # a folder without pictures, and a calibration of another vessel: refused before any work
+    (
+        "segment {here} -o {here}/g1 --calibration {calibration} --method colour --onnx {mask} --classes water,sky "
+        "--count 1 --measure {here} --horizon-row 5 --field-deg 60 --height-m 2 --topic camera.front=/a "
+        "--topics {topics} --json {here}/g1.json",
+        (1, 2),
+        "",
+    ),
+    ("segment {here} --out {here}/g2 --count 0", 2, "at least one"),
+    ("segment {here} --output {here}/g3 --count 0", 2, "at least one"),
+    (
+        "stixels {calibration} {images} -o {here}/x1 --height-m 2 --count 1 --onnx {mask} --classes water,sky "
+        "--match --radius-m 30 --topic camera.front=/a --topics {topics} --json {here}/x1.json",
+        (1, 2),
+        "",
+    ),
+    ("stixels {calibration} {images} --out {here}/x2 --no-match --count 0", 2, "at least one"),
+    ("stixels {calibration} {images} --output {here}/x3 --count 0", 2, "at least one"),
+    (
+        "depth {calibration} {images} -o {here}/d1 --at 1 --count 1 --height-m 2 --nearest-m 3 --topic camera.front=/a "
+        "--topics {topics} --json {here}/d1.json",
+        (1, 2),
+        "",
+    ),
+    ("depth {calibration} {images} --out {here}/d2 --count 0", 2, "at least one"),
+    ("depth {calibration} {images} --output {here}/d3 --count 0", 2, "at least one"),
     # a wrong recording, or one too short: refused before any work
     (
         "surround {calibration} {images} -o {here}/s1.png --view topdown --at 1 --size 64x32 --stabilise off "

@@ -17,7 +17,7 @@ def command(
     ],
     recording: Annotated[Path, typer.Argument(help="Recording, or a folder with one picture per camera.")],
     output: Annotated[
-        Path, typer.Option("-o", "--out", help="Folder for ranges, pictures and point clouds.")
+        Path, typer.Option("-o", "--out", "--output", help="Folder for ranges, pictures and point clouds.")
     ],
     at: Annotated[
         float | None, typer.Option(help="Seconds after the first picture; default: evenly spaced.")

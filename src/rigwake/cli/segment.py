@@ -13,7 +13,7 @@ from rigwake.cli.options import JsonOption, TopicOption, TopicsOption, require
 
 def command(
     source: Annotated[Path, typer.Argument(help="Recording, folder of pictures, or a picture.")],
-    output: Annotated[Path, typer.Option("-o", "--out", help="Folder for labels and overlays.")],
+    output: Annotated[Path, typer.Option("-o", "--out", "--output", help="Folder for labels and overlays.")],
     calibration: Annotated[
         Path | None,
         typer.Option(help="Calibration of the rig: all cameras in one level strip, smoothed over time."),

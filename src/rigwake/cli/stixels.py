@@ -16,7 +16,9 @@ def command(
         Path, typer.Argument(help="calibration.yaml (or its folder), truth.yaml or rig.yaml.")
     ],
     recording: Annotated[Path, typer.Argument(help="Recording, or a folder with one picture per camera.")],
-    output: Annotated[Path, typer.Option("-o", "--out", help="Folder for stixels, overlays and top views.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--out", "--output", help="Folder for stixels, overlays and top views.")
+    ],
     height_m: Annotated[
         float | None,
         typer.Option(help="Mean height of the cameras above the water, metres; default: estimated."),
