@@ -11,7 +11,7 @@ from cli_runs import commands_by_words, run, write_examples
 # (command, exit code, words of the message); names in braces are files of `write_examples`
 WRONG = [
     # no such command, option, or value
-    ("calibrat x", 2, "No such command 'calibrat'. Did you mean 'calibrate'?"),
+    ("calibrat x", 2, "No such command 'calibrat'. Did you mean 'calibrate', 'recalibrate'?"),
     ("--nonsense", 2, "No such option: --nonsense"),
     ("calibrate {images} -o {here}/new --nonsense", 2, "No such option: --nonsense"),
     ("calibrate {images} -o", 2, "requires an argument"),
