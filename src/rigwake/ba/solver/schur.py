@@ -18,6 +18,7 @@ from numba import njit
 from rigwake._types import Array, Indices
 from rigwake.parallel import over_ranges, ranges
 
+_NO_INFORMATION = 1e-100  # of a landmark's direction: its inverse would overflow
 _LEAST_INFORMATION = (
     1e-10  # added to a landmark's scaled (unit diagonal) block: parallax too small to place it
 )
@@ -183,7 +184,7 @@ def _invert_damped(V, damping, out):  # type: ignore[no-untyped-def]
     """Inverse of the symmetric 3x3 `V + damping diag(V)`, by its adjugate after scaling to unit diagonal."""
     s = np.empty(3)
     for i in range(3):
-        s[i] = 1 / np.sqrt(V[i, i]) if V[i, i] > 0 else 0.0
+        s[i] = 1 / np.sqrt(V[i, i]) if V[i, i] > _NO_INFORMATION else 0.0
     d = 1 + damping + _LEAST_INFORMATION
     a, b, c = V[0, 1] * s[0] * s[1], V[0, 2] * s[0] * s[2], V[1, 2] * s[1] * s[2]
     c00, c01, c02 = d * d - c * c, b * c - a * d, a * c - b * d
