@@ -64,7 +64,7 @@ def test_names_are_there_and_callable():
     assert set(api.FUNCTIONS) < set(rigwake.__all__)
     assert all(callable(getattr(rigwake, name)) for name in api.FUNCTIONS)
     assert {"Calibration", "Recording", "Trajectory"} <= set(rigwake.__all__) <= set(dir(rigwake))
-    shell_only = {"surround", "recalibrate", "log", "convert", "demo"}
+    shell_only = {"surround", "recalibrate", "log", "convert", "demo", "segment", "stixels", "depth"}
     assert set(VERBS) - shell_only <= set(api.FUNCTIONS)
     with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
         _ = rigwake.calibrat

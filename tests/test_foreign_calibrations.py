@@ -234,7 +234,7 @@ def test_a_range_must_be_a_distance(tmp_path: Path, value: str) -> None:
     path = write(tmp_path / "a.yaml", camchain((0, 1, 2), ()))
     code, _, message = run("diff", path, path, "--range", value)
     assert code == 2
-    assert "no distance" in message
+    assert "above 0" in message
 
 
 def test_all_pairs_of_formats_agree(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def test_what_determines_nothing_ends_with_exit_code_3(tmp_path, run, monkeypatc
     nothing = HandeyeResult(
         "rig", {"port": one_axis}, there, np.eye(6), empty, "increments", {}, 5, 0, 3, converged=True
     )
-    monkeypatch.setattr("rigwake.handeye.joint_calibration.calibrate_handeye", lambda *_: nothing)
+    monkeypatch.setattr("rigwake.pipeline.handeye_run.calibrate_handeye", lambda *_: nothing)
     rig = write_tum(tmp_path / "rig.tum", wavy(TIMES))
     code, _ = run(rig, rig, "--json", tmp_path / "out.json")
     assert code == 3

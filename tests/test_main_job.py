@@ -25,7 +25,6 @@ from rigwake.config import load_config
 from rigwake.evaluation.rig_errors import RigErrors, evaluate_calibration
 from rigwake.geometry.interpolate import interpolate
 from rigwake.geometry.se3 import SE3
-from rigwake.pipeline import calibration_run
 from rigwake.pipeline.calibration_run import CalibrationRun, calibrate
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.readers.truth_files import rig_in_frame
@@ -187,14 +186,11 @@ class TestWhatIsLeft:
 
 
 class TestResume:
-    def test_finished_cameras_are_not_tracked_again(
-        self, sail: Sail, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_finished_cameras_are_not_tracked_again(self, sail: Sail) -> None:
         def refuse(*_: object, **__: object) -> None:
             raise AssertionError("tracked again")
 
-        monkeypatch.setattr(calibration_run, "process_cameras", refuse)
-        again = calibrate(sail.path, sail.run.out, load_config(jobs=1), resume=True)
+        again = calibrate(sail.path, sail.run.out, load_config(jobs=1), resume=True, run_cameras=refuse)
         for name, camera in sail.run.calibration.cameras.items():
             np.testing.assert_array_equal(
                 again.calibration.cameras[name].rig_from_cam.matrix, camera.rig_from_cam.matrix
@@ -204,18 +200,17 @@ class TestResume:
     @pytest.mark.parametrize(
         "setting", ["tracking.max_features=300", "duration_s=15.5", "find_self_mask=false"]
     )
-    def test_what_the_stage_depends_on_starts_it_again(
-        self, sail: Sail, monkeypatch: pytest.MonkeyPatch, setting: str
-    ) -> None:
+    def test_what_the_stage_depends_on_starts_it_again(self, sail: Sail, setting: str) -> None:
         class TrackedError(Exception):
             pass
 
         def note(*_: object, **__: object) -> None:
             raise TrackedError
 
-        monkeypatch.setattr(calibration_run, "process_cameras", note)
         with pytest.raises(TrackedError):
-            calibrate(sail.path, sail.run.out, load_config(None, (setting,), jobs=1), resume=True)
+            calibrate(
+                sail.path, sail.run.out, load_config(None, (setting,), jobs=1), resume=True, run_cameras=note
+            )
 
 
 OFFSETS_S = (0.03, -0.02)

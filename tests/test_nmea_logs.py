@@ -116,7 +116,8 @@ def test_a_date_belongs_to_its_sentence(tmp_path: Path, where: str) -> None:
 def test_days_between_two_recordings_in_one_log(tmp_path: Path) -> None:
     lines = [rmc(1000 + k, k, "141123") + gga(1000 + k, k) for k in range(5)]
     lines += [rmc(2000 + k, k, "181123") + gga(2000 + k, k) for k in range(5)]
-    stream, _ = read(tmp_path / "log.nmea", "".join(lines))
+    (tmp_path / "log.nmea").write_text("".join(lines))
+    stream = read_nmea(tmp_path / "log.nmea", "log")[0]
     assert np.diff(stream.timestamps_ns)[4] == (4 * 86400 + 1000 - 4) * 10**9
 
 

@@ -1,4 +1,7 @@
-"""Many recordings: each once, on this machine or a cluster, and a table of all."""
+"""Many recordings: each once, on this machine or a cluster, and a table of all.
+
+Example: [cyan]rigwake fleet calibrate 'boats/*/*.bag' --out OUT[/cyan]
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""On board: a ROS node that records, calibrates and watches."""
+"""On board: a ROS node that records, calibrates and watches.
+
+Example: [cyan]rigwake ros node --out /data/rigwake[/cyan]
+"""
 
 from __future__ import annotations
 

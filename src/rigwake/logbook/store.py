@@ -20,6 +20,7 @@ from rigwake.calibration import Calibration
 from rigwake.calibration.yaml_file import calibration_from_dict, calibration_to_dict
 from rigwake.errors import InputError, RigwakeError, UsageError
 from rigwake.logbook.vessel_fingerprint import VesselFingerprint, fingerprint_of_calibration
+from rigwake.yaml_input import parse_yaml
 
 SCHEMA_VERSION = 1
 _APPLICATION_ID = 0x72676C67  # "rglg"
@@ -266,7 +267,9 @@ class Logbook:
                 consequence="It was not used.",
                 remedy="Restore the file from a copy.",
             )
-        return calibration_from_dict(yaml.safe_load(document), f"{self.path.name}, calibration {number}")
+        return calibration_from_dict(
+            parse_yaml(document, self.path.name), f"{self.path.name}, calibration {number}"
+        )
 
     def at(self, time_ns: int) -> LoggedCalibration:
         """The calibration valid at a time; UsageError where there is none."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rigwake.errors import UnobservableError
+from rigwake.errors import EstimationError, UnobservableError
 from rigwake.handeye.handeye_result import HandeyeOptions, HandeyeResult
 from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.handeye.one_body import in_one_unit
@@ -28,8 +28,11 @@ def run_handeye(
         noticed += [] if finding is None else [finding]
     try:
         result = calibrate_handeye(reference, members, options)
-    except UnobservableError as error:
+    except (EstimationError, UnobservableError) as error:
         raise explain_failure(reference, members, error, options) from error
-    checks = tuple(check_handeye(reference, members, result, options)) if options.method == "ml" else ()
+    determined = any(camera.has_figures for camera in result.members.values())
+    checks: tuple[SensorCheck, ...] = ()
+    if options.method == "ml" and determined:  # else there is nothing that could agree
+        checks = tuple(check_handeye(reference, members, result, options))
     refuse(checks, "No calibration is made from it.")
     return result, checks, tuple(noticed)
