@@ -132,7 +132,8 @@ def calibrated(
     prior: RigPrior | None = None,
 ) -> Calibrated:
     """From tracks to a rig, as `rigwake calibrate` does it, without cross-camera association (it needs images)."""
-    config = load_config(None, ("adjustment.cross_camera=false", *settings))
+    # the lenses of a simulation are exact; tests of their refinement say so
+    config = load_config(None, ("adjustment.cross_camera=false", "intrinsics=fixed", *settings))
     recording: Recording = world.recording
     selection = select(recording, config)
     trajectories = own_odometry(world) if trajectories is None else trajectories
