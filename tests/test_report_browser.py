@@ -19,7 +19,7 @@ from selenium.webdriver.chrome.service import Service  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.common.keys import Keys  # noqa: E402
 
-TABS = ["rig", "extrinsics", "doubt", "residuals", "checks", "motion", "settings"]
+TABS = ["rig", "extrinsics", "uncertainty", "residuals", "checks", "motion", "settings"]
 AXE = Path(__file__).parent.parent / ".venv" / "axe" / "node_modules" / "axe-core" / "axe.min.js"
 FLAGS = (
     "--headless=new",

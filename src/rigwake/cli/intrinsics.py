@@ -99,8 +99,10 @@ def command(
         words = _words_again(images, board, image_size, fov, fix, free)
         next_step([*words, "--model", result.camera.model, "-o", f"{camera_name}.yaml"], "write it to a file")
     else:
-        words = ["rigwake", "calibrate", "REC", "--camera-file", str(output), "-o", "OUT"]
-        next_step(words, "calibrate the rig with this camera; REC is your recording")
+        next_step(
+            ["rigwake", "calibrate", "--help"],
+            f"then: calibrate RECORDING --camera-file {escape(str(output))} -o OUT",
+        )
 
 
 def _words_again(
