@@ -130,7 +130,7 @@ def score_blocks(
 ) -> BlockScores:
     """Score every block of a recording, in the order of time.
 
-    tracks: of every camera of the rig. rig: in the IMU's frame (`motion.py`), every number known. starts_ns: of the
+    tracks: of every camera of the rig. rig: in the IMU's frame (`rig_motion.py`), every number known. starts_ns: of the
     blocks; from the first to the last frame by default. bias: of the gyro, where it is known from before.
     """
     if starts_ns is None:

@@ -1,7 +1,7 @@
 """Where to look for which landmark: predictions of landmarks into the images of every camera, by the current rig.
 
 A landmark may show in another camera, or in the same one after a turn. Its patch is warped as a plane that faces
-both viewers halfway would be. `cross_camera.py` carries the searches out.
+both viewers halfway would be. `association.py` carries the searches out.
 """
 
 from __future__ import annotations
