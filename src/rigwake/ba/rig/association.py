@@ -1,6 +1,7 @@
 """Landmarks across cameras and time: what one camera tracked, found again by another, or by itself after a turn.
 
-Once a first solution says where to look (`search_proposals.py`), each patch is looked for and registered there. What agrees
+Once a first solution says where to look (`search_proposals.py`), each patch is looked for and registered there. What
+agrees
 becomes an observation of the same landmark: cameras without common view are then tied by the world itself, which is
 what fixes vertical offsets on calm water.
 """
