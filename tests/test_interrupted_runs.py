@@ -167,7 +167,7 @@ def test_two_runs_in_one_folder_and_a_removed_one(recording: Path, tmp_path: Pat
     assert "Another run" in said
     with recording.open("r+b") as file:  # as if the recording were still being written
         file.seek(0, os.SEEK_END)
-        size = file.progress()
+        size = file.tell()
         file.write(b"more")
     try:
         code, said = first.end()
