@@ -20,7 +20,7 @@ from rigwake.calibration import Calibration, load_calibration
 from rigwake.config import load_config
 from rigwake.errors import RigwakeError
 from rigwake.evaluation.rig_errors import evaluate_calibration
-from rigwake.handeye.handeye_result import HandeyeOptions
+from rigwake.handeye.handeye_problem import HandeyeOptions
 from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.odometry.metric import metric_start
 from rigwake.odometry.thesis_odometry import estimate_thesis

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import runpy
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter, process_time
@@ -21,12 +22,13 @@ from time import perf_counter, process_time
 import cv2
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+from closed_forms import CLOSED_FORMS
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.closed_forms import CLOSED_FORMS
-from rigwake.handeye.handeye_result import HandeyeOptions
+from rigwake.handeye.handeye_problem import HandeyeOptions
+from rigwake.handeye.initial_mounting import thesis_handeye
 from rigwake.handeye.joint_calibration import calibrate_handeye
-from rigwake.handeye.thesis_handeye import thesis_handeye
 from rigwake.trajectory import Trajectory
 
 STUDY = runpy.run_path(str(Path(__file__).with_name("noise_study.py")))

@@ -20,12 +20,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+from closed_forms import park_martin
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
-from rigwake.handeye.closed_forms import park_martin
-from rigwake.handeye.handeye_result import HandeyeOptions
+from rigwake.handeye.handeye_problem import HandeyeOptions
 from rigwake.handeye.joint_calibration import calibrate_handeye
-from rigwake.handeye.resample import TrajectoryCurve
+from rigwake.handeye.motions import TrajectoryCurve
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.trajectory import Trajectory
 

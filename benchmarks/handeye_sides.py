@@ -13,7 +13,7 @@ import numpy as np
 
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.handeye_result import HandeyeOptions, NoiseLevel, NoiseModel
+from rigwake.handeye.handeye_problem import HandeyeOptions, NoiseLevel, NoiseModel
 from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.trajectory import Trajectory
 

@@ -18,13 +18,12 @@ import numpy as np
 
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.handeye_problem import pose_problem, step_covariances
-from rigwake.handeye.handeye_result import HandeyeOptions, NoiseLevel
-from rigwake.handeye.information import form_equations
+from rigwake.handeye.handeye_problem import HandeyeOptions, NoiseLevel, pose_problem, step_covariances
+from rigwake.handeye.initial_mounting import thesis_handeye
 from rigwake.handeye.joint_calibration import calibrate_handeye
+from rigwake.handeye.likelihood import form_equations
 from rigwake.handeye.motions import Mounting, residuals
 from rigwake.handeye.noise import Jitter, known_noise
-from rigwake.handeye.thesis_handeye import thesis_handeye
 from rigwake.trajectory import Trajectory
 
 POSES, RADIUS_M, STEP_NS = 176, 20.0, 100_000_000

@@ -9,18 +9,21 @@ corners: the same detector on an ideal analytic picture.
 from __future__ import annotations
 
 import resource
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from rigwake.cameras.registry import camera_from_params
 from rigwake.simulation.record import SeaCache, Shot, build_world
 from rigwake.simulation.scenario import load_scenario
-from rigwake.simulation.selfcheck import corner_errors, motion_agreement
 from rigwake.simulation.setup import Simulation, prepare
 from rigwake.simulation.tracks_only import simulate_tracks
+from simulation_selfcheck import corner_errors, motion_agreement
 
 WORKERS = 2
 IMAGES = 24

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from rigwake.calibration import CalibratedCamera
 from rigwake.errors import UnobservableError
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.handeye_result import HandeyeOptions, NoiseLevel
+from rigwake.handeye.handeye_problem import HandeyeOptions, NoiseLevel
 from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.trajectory import Trajectory
 

@@ -20,7 +20,7 @@ from handeye_scenes import (
 )
 from rigwake.errors import UnobservableError, UsageError
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.handeye_result import HandeyeOptions, NoiseLevel
+from rigwake.handeye.handeye_problem import HandeyeOptions, NoiseLevel
 from rigwake.handeye.joint_calibration import calibrate_handeye
 
 TIMES = np.arange(300) * 0.1

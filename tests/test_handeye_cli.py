@@ -13,7 +13,7 @@ from rigwake.calibration import CalibratedCamera, load_calibration
 from rigwake.calibration.rig_calibration import UnobservableDirection
 from rigwake.cli.main import main
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.handeye_result import HandeyeResult
+from rigwake.handeye.handeye_problem import HandeyeResult
 from rigwake.readers.open import open_recording
 from rigwake.writers import trajectory_writer
 

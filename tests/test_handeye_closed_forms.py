@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from closed_forms import CLOSED_FORMS
 from geometry_strategies import transforms
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.closed_forms import CLOSED_FORMS
-from rigwake.handeye.thesis_handeye import linear_handeye
+from rigwake.handeye.initial_mounting import linear_handeye
 
 SOLVERS = {**CLOSED_FORMS, "seed": linear_handeye}
 

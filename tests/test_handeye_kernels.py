@@ -9,8 +9,14 @@ from geometry_strategies import transforms
 from handeye_scenes import PORT, drifting, trajectory, wavy
 from rigwake.geometry.se3 import SE3
 from rigwake.handeye import kernels, noise_kernels, normal_kernels
-from rigwake.handeye.motions import Mounting, MountingLayout, linearise, residuals, steps_between
-from rigwake.handeye.resample import TrajectoryCurve
+from rigwake.handeye.motions import (
+    Mounting,
+    MountingLayout,
+    TrajectoryCurve,
+    linearise,
+    residuals,
+    steps_between,
+)
 
 TIMES = np.arange(40) * 0.1
 

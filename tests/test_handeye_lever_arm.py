@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from handeye_scenes import camera, drifting, jittered, trajectory, wavy
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.handeye_result import HandeyeOptions, NoiseLevel
+from rigwake.handeye.handeye_problem import HandeyeOptions, NoiseLevel
 from rigwake.handeye.joint_calibration import calibrate_handeye
-from rigwake.handeye.lever_arm import levels_by_lever_arm
+from rigwake.handeye.noise_kernels import levels_by_lever_arm
 
 POSES = 176
 TIMES = np.arange(POSES) * 0.2

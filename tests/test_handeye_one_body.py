@@ -8,9 +8,8 @@ import pytest
 from rigwake.errors import EstimationError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.handeye_result import HandeyeOptions
+from rigwake.handeye.handeye_problem import HandeyeOptions, in_one_unit
 from rigwake.handeye.joint_calibration import calibrate_handeye
-from rigwake.handeye.one_body import in_one_unit
 from rigwake.trajectory import Trajectory
 
 X = SE3.exp(np.array([0.5, -0.8, 0.3, 0.8, -0.45, 1.2]))

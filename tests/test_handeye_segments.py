@@ -8,7 +8,7 @@ import numpy as np
 from handeye_scenes import PORT, wavy
 from rigwake.geometry.se3 import SE3
 from rigwake.handeye.joint_calibration import calibrate_handeye
-from rigwake.handeye.resample import longest_segments
+from rigwake.handeye.motions import longest_segments
 from rigwake.trajectory import Trajectory
 
 

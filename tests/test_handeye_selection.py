@@ -5,9 +5,8 @@ import pytest
 
 from handeye_scenes import PORT, drifting, jittered, lasting, trajectory, wavy
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.handeye_result import HandeyeOptions
-from rigwake.handeye.joint_calibration import calibrate_handeye
-from rigwake.handeye.noise_selection import wandering
+from rigwake.handeye.handeye_problem import HandeyeOptions
+from rigwake.handeye.joint_calibration import calibrate_handeye, wandering
 
 TIMES = np.arange(600) * 0.1
 SYNCHRONOUS = HandeyeOptions(time_offset=False)

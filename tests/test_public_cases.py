@@ -11,9 +11,8 @@ from rigwake.errors import EstimationError
 from rigwake.exporters import read_calibration
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.handeye_result import HandeyeOptions
+from rigwake.handeye.handeye_problem import HandeyeOptions, in_one_unit
 from rigwake.handeye.joint_calibration import calibrate_handeye
-from rigwake.handeye.one_body import in_one_unit
 from rigwake.readers.open import open_recording
 from rigwake.readers.trajectories import read_trajectory
 

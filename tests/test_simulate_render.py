@@ -21,13 +21,13 @@ from rigwake.simulation.scenario import ImageNoise, Scenario, Scene, Sea, build_
 from rigwake.simulation.scene_layout import build_layout
 from rigwake.simulation.scenery import KeepClear, build_scenery
 from rigwake.simulation.sea_surface import meet_water, water_at
-from rigwake.simulation.selfcheck import corner_errors, motion_agreement
 from rigwake.simulation.setup import Simulation, prepare
 from rigwake.simulation.shading import HULL, LAND, SKY, WATER
 from rigwake.simulation.skyline import gather_boxes, in_band, seen_band
 from rigwake.simulation.textures import build_atlas
 from rigwake.simulation.truth_writer import truth_to_dict, write_truth
 from rigwake.simulation.waves import build_wave_field
+from simulation_selfcheck import corner_errors, motion_agreement
 
 
 def small(**changes: object) -> Scenario:

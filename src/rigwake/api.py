@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rigwake.evaluation.rig_errors import CameraDifference, RigErrors
     from rigwake.evaluation.trajectory_evaluation import TrajectoryEvaluation
     from rigwake.geometry.align import AlignmentKind
-    from rigwake.handeye.handeye_result import HandeyeResult
+    from rigwake.handeye.handeye_problem import HandeyeResult
     from rigwake.inspection.readiness import Readiness
     from rigwake.inspection.recording_inspection import Inspection
     from rigwake.intrinsics.board_calibration import IntrinsicCalibration
@@ -196,7 +196,7 @@ def handeye(
     when they did not move enough, InputError where a trajectory contradicts the others.
     """
     from rigwake.calibration import save_calibration
-    from rigwake.handeye.handeye_result import HandeyeOptions
+    from rigwake.handeye.handeye_problem import HandeyeOptions
     from rigwake.pipeline.handeye_run import run_handeye
 
     options = HandeyeOptions(

@@ -16,7 +16,7 @@ from rigwake.errors import UnobservableError
 
 if TYPE_CHECKING:
     from rigwake.calibration import CalibratedCamera
-    from rigwake.handeye.handeye_result import HandeyeResult
+    from rigwake.handeye.handeye_problem import HandeyeResult
     from rigwake.trajectory import Trajectory
 
 _METHODS = ("ml", "thesis", "seed")
@@ -80,7 +80,7 @@ def command(
     inputs = [_Input.parse(text) for text in (reference, *others)]
     require_there(*(one.path for one in inputs))
     from rigwake.calibration import save_calibration
-    from rigwake.handeye.handeye_result import HandeyeOptions
+    from rigwake.handeye.handeye_problem import HandeyeOptions
     from rigwake.pipeline.handeye_run import run_handeye
     from rigwake.plausibility.values import checks_to_list
 

@@ -18,8 +18,8 @@ from scipy.stats import chi2
 from rigwake._types import Array
 from rigwake.geometry.se3 import SE3
 from rigwake.handeye import noise_kernels, normal_kernels
-from rigwake.handeye.lever_arm import TRANSLATION_FLOOR, levels_by_lever_arm
-from rigwake.handeye.resample import TrajectoryCurve
+from rigwake.handeye.motions import TrajectoryCurve
+from rigwake.handeye.noise_kernels import TRANSLATION_FLOOR, levels_by_lever_arm
 
 ROTATION_FLOOR = 1e-9  # rad; nothing is known better than rounding allows
 FLOOR = np.repeat([ROTATION_FLOOR**2, TRANSLATION_FLOOR**2], 3)

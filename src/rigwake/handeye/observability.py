@@ -18,14 +18,14 @@ from rigwake._types import Array
 from rigwake.calibration.rig_calibration import UnobservableDirection
 from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
 from rigwake.handeye.handeye_problem import HandeyeProblem
-from rigwake.handeye.information import (
+from rigwake.handeye.likelihood import (
     USEFUL_ROTATION,
     USEFUL_TRANSLATION,
     Equations,
+    HandeyeEstimate,
     split_observable,
     useful_units,
 )
-from rigwake.handeye.likelihood import HandeyeEstimate
 
 _OPEN_UNITS = 10.0  # how far an open direction may be off: 50 degrees, 10 m
 _BLOCKS = 30  # of time, whose scores are taken to be independent

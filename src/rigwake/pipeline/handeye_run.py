@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rigwake.errors import EstimationError, UnobservableError
-from rigwake.handeye.handeye_result import HandeyeOptions, HandeyeResult
+from rigwake.handeye.handeye_problem import HandeyeOptions, HandeyeResult, in_one_unit
 from rigwake.handeye.joint_calibration import calibrate_handeye
-from rigwake.handeye.one_body import in_one_unit
 from rigwake.plausibility.handeye_fit import check_handeye, explain_failure
 from rigwake.plausibility.values import SensorCheck, refuse
 from rigwake.recording import Finding

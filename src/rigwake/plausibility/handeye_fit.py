@@ -17,7 +17,7 @@ from rigwake.errors import InputError, RigwakeError
 from rigwake.geometry import so3
 from rigwake.geometry.interpolate import interpolate
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.handeye_result import HandeyeOptions, HandeyeResult
+from rigwake.handeye.handeye_problem import HandeyeOptions, HandeyeResult
 from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.plausibility.values import SensorCheck
 from rigwake.trajectory import Trajectory

@@ -18,7 +18,7 @@ from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import RigwakeError, UnobservableError
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.handeye_result import HandeyeResult
+from rigwake.handeye.handeye_problem import HandeyeResult
 from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.odometry.metric import metric_start
 from rigwake.recording import GnssStream, ImuStream

@@ -16,7 +16,7 @@ from rigwake.calibration.rig_calibration import UnobservableDirection
 from rigwake.errors import UnobservableError, UsageError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
-from rigwake.handeye.information import USEFUL_ROTATION, USEFUL_TRANSLATION
+from rigwake.handeye.likelihood import USEFUL_ROTATION, USEFUL_TRANSLATION
 from rigwake.handeye.observability import unobservable_directions
 
 _OPEN_ROTATION, _OPEN_TRANSLATION = np.deg2rad(50.0), 10.0  # stands for "not at all" in a covariance
