@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: demo test test-fast lint bench mutants docs release-check clean
+.PHONY: demo test test-fast lint bench mutants coverage docs release-check clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -31,6 +31,13 @@ bench: $(STAMP)
 
 mutants: $(STAMP)
 	$(BIN)/python tests/run_mutants.py
+
+# fast suite over the main job; the table by package comes last
+coverage: $(STAMP)
+	rm -rf build/coverage
+	$(BIN)/coverage run -m pytest -n 2 --dist loadgroup -m "not slow"
+	$(BIN)/coverage combine --quiet
+	$(BIN)/python tests/coverage_table.py
 
 docs: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'

@@ -92,7 +92,7 @@ def number(value: float, digits: int) -> str:
     """Fixed decimals with a true minus sign, or the words for what there is no number for."""
     if not np.isfinite(value):
         return UNOBSERVABLE
-    return f"{value + 0.0:.{digits}f}".replace("-", "−")
+    return f"{round(value, digits) + 0.0:.{digits}f}".replace("-", "−")
 
 
 def decimals(std: float) -> int:
