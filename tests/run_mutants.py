@@ -20,7 +20,6 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import cv2  # noqa: F401
-import hypothesis  # noqa: F401
 import numba
 import pytest
 import scipy.optimize

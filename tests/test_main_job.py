@@ -176,19 +176,6 @@ class TestWhatIsLeft:
                 distances.append(np.hypot(*np.subtract(point["predicted_px"], point["observed_px"])))
         assert np.median(distances) < 0.5
 
-    def test_the_horizon_is_drawn_at_right_angles_to_up(self, sail: Sail) -> None:
-        entries = json.loads((sail.run.out / "pictures" / "pictures.json").read_text())
-        for entry in (e for e in entries if e["kind"] == "horizon"):
-            path = read_trajectory(sail.run.out / "trajectories" / f"{entry['camera']}.tum").trajectory
-            stamp = np.array([entry["timestamp_ns"]])
-            pose = interpolate(path.timestamps_ns, path.world_from_body, stamp)
-            model = sail.recording.cameras[entry["camera"]].model
-            assert model is not None
-            pixels = np.array([pixel for pixel in entry["horizon_px"] if None not in pixel], dtype=float)
-            bearings, _ = model.unproject(pixels)
-            assert len(pixels) > 50
-            assert np.abs(bearings @ pose.rotation[0, 2]).max() < 0.02
-
     def test_tracks_hold_bearings_of_their_pixels(self, sail: Sail) -> None:
         for name in OFFSETS_MS:
             tracks = load_tracks(sail.run.out / "tracks" / f"{name}.npz")

@@ -30,8 +30,9 @@ from rigwake.handeye.noise import noise_over_steps
 from rigwake.odometry.gyro import align_gyro
 from rigwake.odometry.imu_alignment import align_inertial
 from rigwake.odometry.metric import metric_start
-from rigwake.pipeline.outputs import horizon_pixels
-from rigwake.pipeline.stage_files import StageLedger
+from rigwake.pipeline.outputs import horizon_of_image, horizon_pixels, write_trajectories
+from rigwake.pipeline.stage_files import StageLedger, stage_key
+from rigwake.readers.trajectories import read_trajectory
 from rigwake.report.extrinsics import directions, looks
 from rigwake.report.reduce import summarise_residuals
 from rigwake.rig import Rig, RigCamera
@@ -65,6 +66,12 @@ class TestStages:
         file.write_text("changed by hand")
         assert not StageLedger(tmp_path, resume=True).is_done("tracks", "key", file)
 
+    def test_a_key_depends_on_every_part(self) -> None:
+        key = stage_key("tracks", {"a": 1, "b": [2, 3]})
+        assert key == stage_key("tracks", {"b": [2, 3], "a": 1})
+        others = [("rig", {"a": 1, "b": [2, 3]}), ("tracks", {"a": 1, "b": [2, 4]}), ("tracks", {"a": 1})]
+        assert key not in {stage_key(*parts) for parts in others}
+
     def test_files_are_exchanged_whole_and_only_once_they_are_on_the_disk(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -83,7 +90,35 @@ class TestStages:
         assert steps[:2] == ["on disk", "exchanged"]
 
 
+class TestTrajectoriesOfARun:
+    def test_each_camera_is_on_its_own_clock_and_the_rig_on_its_own(
+        self, problem: RigProblem, tmp_path: Path
+    ) -> None:
+        write_trajectories(tmp_path, problem)
+        states = problem.states
+        rig = read_trajectory(tmp_path / "rig.tum").trajectory
+        np.testing.assert_array_equal(rig.timestamps_ns, states.timestamps_ns)
+        np.testing.assert_allclose(rig.world_from_body.matrix, states.world_from_rig.matrix, atol=1e-9)
+        for camera in problem.cameras:
+            found = read_trajectory(tmp_path / f"{camera.name}.tum").trajectory
+            offset_ns = round(camera.time_offset_s * 1e9)
+            assert offset_ns != 0
+            np.testing.assert_array_equal(found.timestamps_ns + offset_ns, states.timestamps_ns)
+            true = states.world_from_rig.matrix @ camera.rig_from_cam.matrix
+            np.testing.assert_allclose(found.world_from_body.matrix, true, atol=1e-9)
+
+
 class TestPictures:
+    def test_the_horizon_is_that_of_the_cameras_own_attitude(self, problem: RigProblem) -> None:
+        camera, states = problem.cameras[1], problem.states
+        at = len(states) // 2
+        stamp = int(states.timestamps_ns[at]) - round(camera.time_offset_s * 1e9)
+        pixels = horizon_of_image(problem, 1, stamp)
+        bearings, _ = camera.model.unproject(pixels[np.isfinite(pixels).all(axis=1)])
+        assert len(bearings) > 50
+        world_from_cam = states.world_from_rig[at] * camera.rig_from_cam
+        np.testing.assert_allclose((bearings @ world_from_cam.rotation.T)[:, 2], 0.0, atol=1e-6)
+
     def test_the_horizon_is_at_right_angles_to_up(self) -> None:
         up_cam = so3.exp(np.array([0.2, -0.4, 0.3])) @ np.array([0.0, -1.0, 0.0])
         pixels = horizon_pixels(FISHEYE, up_cam)

@@ -39,14 +39,15 @@ def write_outputs(
 ) -> None:
     """Trajectories, residuals, pictures and, last, the calibration itself."""
     problem = adjusted.solution.problem
-    _write_trajectories(out / "trajectories", problem, selection)
+    write_trajectories(out / "trajectories", problem)
     _write_residuals(out / "residuals.npz", adjusted)
     is_level = problem.imu is not None or problem.gnss is not None
     _write_pictures(out / "pictures", problem, selection.cameras, matches, is_level)
     save_calibration(calibration, out / "calibration.yaml")
 
 
-def _write_trajectories(folder: Path, problem: RigProblem, selection: Selection) -> None:
+def write_trajectories(folder: Path, problem: RigProblem) -> None:
+    """`rig.tum` on the clock of the rig, and of every camera NAME.tum, `world_from_cam` on its own clock."""
     states = problem.states
     write_tum(Trajectory("rig", states.timestamps_ns, states.world_from_rig), folder / "rig.tum")
     for camera in problem.cameras:
@@ -90,8 +91,7 @@ def _write_pictures(
         stream = streams[camera.name]
         if is_level:
             for stamp in _spread_stamps(problem, index):
-                cam_from_world = camera_from_world(problem, index, np.array([stamp]))[0]
-                horizon = horizon_pixels(camera.model, cam_from_world.rotation[:, 2])
+                horizon = horizon_of_image(problem, index, stamp)
                 entry = {"kind": "horizon", "horizon_px": horizon.round(1).tolist(), "points": []}
                 entries += _save_picture(folder, stream, stamp, len(entries), entry)
         for stamp, rows in _busiest_images(matches, index):
@@ -157,6 +157,12 @@ def _write_jpeg(path: Path, image: Image) -> None:
     if ok:
         with atomic_path(path) as temporary:
             temporary.write_bytes(encoded.tobytes())
+
+
+def horizon_of_image(problem: RigProblem, camera: int, timestamp_ns: int) -> Array:
+    """(N, 2) pixels of the horizon in a camera's image of this stamp, on its own clock; NaN outside the image."""
+    cam_from_world = camera_from_world(problem, camera, np.array([timestamp_ns]))[0]
+    return horizon_pixels(problem.cameras[camera].model, cam_from_world.rotation[:, 2])
 
 
 def horizon_pixels(model: CameraModel, up_cam: Array) -> Array:
