@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rigwake.ba.rig.rig_values import InitialValues, RigMeasurements
+from rigwake.ba.rig.rig_values import InitialRig, RigMeasurements
 from rigwake.ba.solver.rig_problem import BundleCamera
 from rigwake.calibration import Calibration
 from rigwake.config import load_config
@@ -56,7 +56,7 @@ def with_clocks(world: SimulatedTracks, offsets_ms: Mapping[str, float]) -> Simu
 
 def first_values(
     world: SimulatedTracks, seed: int = 0, turn_deg: float = 1.0, shift_m: float = 0.05
-) -> InitialValues:
+) -> InitialRig:
     """The truth in the IMU's frame, with motion, mountings and antenna off at random."""
     recording, rng = world.recording, np.random.default_rng(seed)
     truth = rig_in_frame(recording.true_rig, "imu")
@@ -75,7 +75,7 @@ def first_values(
         for name, stream in recording.cameras.items()
     }
     trajectory = Trajectory("imu", body.timestamps_ns, world_from_imu)
-    return InitialValues(trajectory, cameras, antenna_rig=truth.antenna_rig + rng.normal(0, 0.1, 3))
+    return InitialRig(trajectory, cameras, antenna_rig=truth.antenna_rig + rng.normal(0, 0.1, 3))
 
 
 def measurements(world: SimulatedTracks) -> RigMeasurements:

@@ -7,23 +7,23 @@ import signal
 import time
 from pathlib import Path
 
+from rigwake._progress import Progress
 from rigwake.fleet.fleet_jobs import (
     NOT_OBSERVABLE,
     FleetJob,
     FleetOutcome,
-    FleetProgress,
     failure,
     outcome_of,
 )
 from rigwake.fleet.resume import store_outcome
 
 
-def null_work(job: FleetJob, progress: FleetProgress) -> FleetOutcome:
+def null_work(job: FleetJob, progress: Progress) -> FleetOutcome:
     """Nothing, without a file."""
     return outcome_of(job, "calibrated", key=job.name, stored=False)
 
 
-def work_by_name(job: FleetJob, progress: FleetProgress) -> FleetOutcome:
+def work_by_name(job: FleetJob, progress: Progress) -> FleetOutcome:
     """As the name of the recording says; notes every begin in OUT/begun.txt."""
     name = Path(job.recording).stem
     with (Path(job.out) / "begun.txt").open("a") as file:
@@ -57,7 +57,7 @@ def null_line(line: str) -> str:
     return null_work(FleetJob.from_json(line), lambda name, what, fraction: None).to_json()
 
 
-def rig_work(job: FleetJob, progress: FleetProgress) -> FleetOutcome:
+def rig_work(job: FleetJob, progress: Progress) -> FleetOutcome:
     """A rig of two cameras from simulated tracks: some seconds of computing, no images."""
     from calibration_worlds import calibrated, sail, true_odometry
 

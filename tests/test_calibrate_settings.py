@@ -11,8 +11,7 @@ import yaml
 from calibration_worlds import first_values, measurements, sail
 from rigwake._types import Array
 from rigwake.ba.rig.assemble_problem import assemble_problem
-from rigwake.ba.rig.initialisation import InitialRig
-from rigwake.ba.rig.rig_values import AdjustmentOptions
+from rigwake.ba.rig.rig_values import AdjustmentOptions, InitialRig
 from rigwake.ba.solver.rig_problem import PosePrior
 from rigwake.calibration import Calibration
 from rigwake.cli.console import write_json
@@ -41,7 +40,9 @@ def world() -> SimulatedTracks:
 
 
 def first_rig_of(world: SimulatedTracks) -> InitialRig:
-    return InitialRig(first_values(world), Calibration("front", {}), "front", "gnss")
+    return replace(
+        first_values(world), handeye=Calibration("front", {}), reference_camera="front", scale_source="gnss"
+    )
 
 
 class TestSettings:
@@ -124,7 +125,7 @@ class TestPrior:
 
     def test_clocks_and_shutters_follow_the_settings(self, world: SimulatedTracks) -> None:
         config = CalibrateConfig(time_offsets=False, line_delay_s={"left": 2e-5}, estimate_line_delay=True)
-        cameras = RigPrior().applied_to(first_rig_of(world), config).start.cameras
+        cameras = RigPrior().applied_to(first_rig_of(world), config).cameras
         assert cameras["front"].free == {"rig_from_cam"}
         assert cameras["left"].free == {"rig_from_cam", "line_delay"}
         assert (cameras["front"].line_delay_s, cameras["left"].line_delay_s) == (0.0, 2e-5)

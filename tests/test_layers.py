@@ -11,11 +11,13 @@ PACKAGE = Path(__file__).parent.parent / "src" / "rigwake"
 LAYERS = [
     [
         "errors",
+        "_progress",
         "_types",
         "atomic",
         "fingerprint",
         "host_faults",
         "parallel",
+        "robust",
         "workers",
         "kernel_cache",
         "text_files",
@@ -46,7 +48,7 @@ LAYERS = [
     ["views"],
     ["fleet"],  # many recordings, on one machine or a cluster
     ["ros"],  # a node on board; imported by the command line alone
-    ["api"],
+    ["_api_inputs", "_api_results", "api"],
     ["cli", "__main__"],
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

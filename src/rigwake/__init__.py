@@ -14,51 +14,18 @@ from inspect import Signature, signature
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from rigwake.api import FUNCTIONS
 from rigwake.kernel_cache import provide_kernel_cache
 
 if TYPE_CHECKING:
-    from rigwake.api import (
-        calibrate,
-        diff,
-        evaluate,
-        export,
-        handeye,
-        inspect,
-        intrinsics,
-        load_calibration,
-        monitor,
-        odometry,
-        open_recording,
-        report,
-        simulate,
-        undistort,
-    )
-    from rigwake.calibration import Calibration
-    from rigwake.recording import Recording
-    from rigwake.trajectory import Trajectory
+    from rigwake.api import *  # noqa: F403
+    from rigwake.calibration import Calibration as Calibration
+    from rigwake.recording import Recording as Recording
+    from rigwake.trajectory import Trajectory as Trajectory
 
 __version__ = "0.1.0"
-__all__ = [
-    "Calibration",
-    "Recording",
-    "Trajectory",
-    "__version__",
-    "calibrate",
-    "diff",
-    "evaluate",
-    "export",
-    "handeye",
-    "inspect",
-    "intrinsics",
-    "load_calibration",
-    "monitor",
-    "odometry",
-    "open_recording",
-    "report",
-    "simulate",
-    "undistort",
-]
 _VALUES = {"Calibration": "calibration", "Recording": "recording", "Trajectory": "trajectory"}
+__all__ = ["__version__", *_VALUES, *FUNCTIONS]
 _ALSO_PACKAGES = ("handeye", "intrinsics", "monitor", "odometry", "report")
 
 provide_kernel_cache()  # before any module with compiled loops is imported

@@ -7,18 +7,26 @@ All raise the errors of `rigwake.errors`: cause, consequence and remedy, in plac
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from rigwake.errors import InputError, UsageError
+from rigwake._api_inputs import (
+    FilePath,
+    calibration_of,
+    load_calibration,
+    open_recording,
+    opened,
+    silent,
+    topic_map,
+    trajectory_of,
+)
+from rigwake._api_results import diff, evaluate, export, report
+from rigwake._progress import Progress
 
 if TYPE_CHECKING:
     from rigwake.calibration import Calibration
     from rigwake.config import CalibrateConfig
-    from rigwake.evaluation.rig_errors import CameraDifference, RigErrors
-    from rigwake.evaluation.trajectory_evaluation import TrajectoryEvaluation
-    from rigwake.geometry.align import AlignmentKind
     from rigwake.handeye.handeye_problem import HandeyeResult
     from rigwake.inspection.readiness import Readiness
     from rigwake.inspection.recording_inspection import Inspection
@@ -28,14 +36,12 @@ if TYPE_CHECKING:
     from rigwake.pipeline.odometry_run import OdometryRun
     from rigwake.pipeline.prior import RigPrior
     from rigwake.pipeline.undistortion import Target
-    from rigwake.readers.topics import TopicMap
     from rigwake.recording import Recording
-    from rigwake.rig import Rig
     from rigwake.trajectory import Trajectory
 
-FilePath = Path | str
-Progress = Callable[[str, str, float], None]
-FUNCTIONS = (
+__all__ = [
+    "FilePath",
+    "Progress",
     "calibrate",
     "diff",
     "evaluate",
@@ -50,35 +56,12 @@ FUNCTIONS = (
     "report",
     "simulate",
     "undistort",
-)
-__all__ = [*FUNCTIONS, "FilePath", "Progress"]
-
-
-def _silent(name: str, what: str, fraction: float) -> None:
-    """Progress that nobody asked for."""
-
-
-def open_recording(
-    path: FilePath,
-    *,
-    topics: Mapping[str, str] | None = None,
-    camera_files: Mapping[str, FilePath] | None = None,
-) -> Recording:
-    """Open a ROS bag, MCAP file, or folder; images are read when they are used. Raises InputError."""
-    from rigwake.readers.open import open_recording as read
-
-    return read(path, _topic_map(topics, camera_files))
-
-
-def load_calibration(path: FilePath) -> Calibration:
-    """Read a `calibration.yaml`, or a file of any format that `export` writes. Raises InputError."""
-    from rigwake.exporters import read_calibration
-
-    return read_calibration(path)
+]
+FUNCTIONS = tuple(name for name in __all__ if name.islower())
 
 
 def inspect(
-    recording: FilePath | Recording, *, html: FilePath | None = None, progress: Progress = _silent
+    recording: FilePath | Recording, *, html: FilePath | None = None, progress: Progress = silent
 ) -> tuple[Inspection, Readiness]:
     """Sensors, rates, gaps, clocks and motion of a recording, and whether that is enough to calibrate.
 
@@ -89,7 +72,7 @@ def inspect(
     from rigwake.pipeline.checked_inspection import inspect_with_checks
 
     inspection, verdict, _ = inspect_with_checks(
-        _opened(recording), lambda what, done, total: progress("inspect", what, done / max(total, 1))
+        opened(recording), lambda what, done, total: progress("inspect", what, done / max(total, 1))
     )
     if html is not None:
         write_text_atomic(Path(html), inspection_page(inspection, verdict))
@@ -107,7 +90,7 @@ def calibrate(
     resume: bool = False,
     force: bool = False,
     config: FilePath | CalibrateConfig | None = None,
-    progress: Progress = _silent,
+    progress: Progress = silent,
     **settings: Any,
 ) -> Calibration:
     """Find where every camera of a recording sits and looks.
@@ -130,7 +113,7 @@ def calibrate(
         recording,
         out,
         given,
-        topics=_topic_map(topics, camera_files),
+        topics=topic_map(topics, camera_files),
         trajectories=trajectories,
         prior=prior if prior is None or isinstance(prior, RigPrior) else load_prior(prior),
         resume=resume,
@@ -150,7 +133,7 @@ def odometry(
     repair: bool = True,
     jobs: int = 0,
     options: CameraOdometryOptions | None = None,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> OdometryRun:
     """The trajectory of one camera, or of each; writes NAME.tum, tracks and masks into `out`.
 
@@ -163,7 +146,7 @@ def odometry(
     from rigwake.plausibility.values import refuse
 
     run = run_odometry(
-        _opened(recording),
+        opened(recording),
         Path(out),
         options or CameraOdometryOptions(),
         camera=camera,
@@ -205,7 +188,7 @@ def handeye(
         time_offset=time_offset,
         scale=scale,
     )
-    result, _, _ = run_handeye(_trajectory(reference), [_trajectory(other) for other in others], options)
+    result, _, _ = run_handeye(trajectory_of(reference), [trajectory_of(other) for other in others], options)
     if out is not None:
         provenance = {"command": "handeye", "method": method, "noise": result.noise}
         save_calibration(result.calibration(provenance), Path(out))
@@ -222,7 +205,7 @@ def intrinsics(
     free: Sequence[str] = (),
     out: FilePath | None = None,
     name: str = "camera",
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> IntrinsicCalibration:
     """A camera's lens from images of a board (`chessboard:9x6:0.03`, `aprilgrid:6x6:0.088:0.3`).
 
@@ -266,7 +249,7 @@ def undistort(
     to: Target = "pinhole",
     focal_px: float | None = None,
     every: int = 1,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> list[Path]:
     """Undistort images, or one camera of a recording; returns the files written. See `rigwake undistort --help`."""
     from rigwake.pipeline.undistortion import undistort_source
@@ -288,112 +271,6 @@ def undistort(
     )
 
 
-def evaluate(
-    found: FilePath | Calibration | Trajectory,
-    truth: FilePath | Rig | Trajectory,
-    *,
-    gauge: Literal["reference", "align"] = "reference",
-    frame: str = "enu",
-    alignment: AlignmentKind | Literal["auto", "none"] = "auto",
-    max_difference_s: float = 0.01,
-) -> RigErrors | TrajectoryEvaluation:
-    """Errors of a calibration against a known rig, or of a trajectory against a known one.
-
-    gauge: of a rig: in its reference frame, or after fitting the whole rig to the truth. frame: what the transforms of
-    the truth mean. alignment, max_difference_s: of trajectories. See `rigwake evaluate --help`.
-    """
-    from rigwake.evaluation.trajectory_evaluation import evaluate_trajectory, usual_alignment
-    from rigwake.exporters.known_rig_errors import evaluate_against, is_trajectory_file
-    from rigwake.exporters.known_rigs import read_known_rig, rig_in_house_frames
-    from rigwake.readers.trajectories import read_trajectory
-    from rigwake.rig import Rig
-    from rigwake.trajectory import Trajectory
-
-    if isinstance(found, Trajectory) or (isinstance(found, str | Path) and is_trajectory_file(Path(found))):
-        estimate = _trajectory(found)
-        if isinstance(truth, Rig):
-            raise UsageError("A trajectory is compared with a trajectory, not with a rig.")
-        known = truth if isinstance(truth, Trajectory) else read_trajectory(truth, frame=frame).trajectory
-        fitted = usual_alignment(estimate) if alignment == "auto" else alignment
-        return evaluate_trajectory(
-            known,
-            estimate,
-            alignment=None if fitted == "none" else fitted,
-            max_difference_s=max_difference_s,
-        )
-    if isinstance(truth, Trajectory):
-        raise UsageError("A calibration is compared with a rig, not with a trajectory.")
-    rig = truth if isinstance(truth, Rig) else read_known_rig(truth)
-    return evaluate_against(_calibration(found), rig_in_house_frames(rig, frame), gauge=gauge)[1]
-
-
-def diff(
-    first: FilePath | Calibration,
-    second: FilePath | Calibration,
-    *,
-    ranges_m: Sequence[float] = (5.0, 20.0, 100.0),
-) -> dict[str, CameraDifference]:
-    """How far two calibrations of one rig are apart, by camera: degrees, millimetres, and pixels at these ranges."""
-    from rigwake.evaluation.rig_errors import compare_calibrations
-    from rigwake.exporters import in_common_frame
-
-    a, b, _ = in_common_frame(_calibration(first), _calibration(second))
-    return compare_calibrations(a, b, list(ranges_m))
-
-
-def export(
-    calibration: FilePath | Calibration,
-    to: str,
-    out: FilePath,
-    *,
-    parent_frame: str = "",
-    child_frame: str = "{name}_optical_frame",
-    imu: FilePath | None = None,
-    max_fit_error_px: float = 0.5,
-    allow_unobservable: bool = False,
-) -> tuple[str, ...]:
-    """Write a calibration in another program's format; returns what the user must know about the result.
-
-    to: a format of `rigwake export --help`. imu: Kalibr's imu.yaml, for formats that hold IMU noise. Raises
-    UnobservableError for cameras that are not fully determined, unless `allow_unobservable` leaves them out.
-    """
-    from rigwake.exporters import FORMATS, ExportOptions, export_calibration
-    from rigwake.exporters.basalt import read_imu_noise
-
-    if to not in FORMATS:
-        raise UsageError(f"The format {to!r} is unknown.", remedy=f"Choose from {', '.join(FORMATS)}.")
-    noise = None if imu is None else read_imu_noise(Path(imu))
-    options = ExportOptions(parent_frame, child_frame, noise, max_fit_error_px)
-    found = _calibration(calibration)
-    return tuple(export_calibration(found, to, Path(out), options, allow_unobservable=allow_unobservable))
-
-
-def report(
-    folder: FilePath,
-    *,
-    figures: FilePath | None = None,
-    figure_format: Literal["png", "svg"] = "png",
-    rrd: FilePath | None = None,
-) -> Path:
-    """Rebuild `report.html` in the folder of a calibration and return its path.
-
-    figures: also write figures for papers to this folder. rrd: also a recording for the rerun viewer.
-    """
-    from rigwake.report import build_report, load_report_content
-
-    content = load_report_content(folder)
-    page = build_report(content)
-    if figures is not None:
-        from rigwake.report.figures import write_figures
-
-        write_figures(content, Path(figures), figure_format)
-    if rrd is not None:
-        from rigwake.report.rerun_log import log_to_rerun
-
-        log_to_rerun(content, Path(rrd), view=False)
-    return page
-
-
 def simulate(
     scenario: FilePath = "demo",
     out: FilePath | None = None,
@@ -402,7 +279,7 @@ def simulate(
     seed: int | None = None,
     jobs: int = 1,
     truth_images: bool = False,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> Recording:
     """Simulate a recording with known truth and write it: OUT.bag (ROS 1), OUT.mcap (ROS 2) or a folder.
 
@@ -430,7 +307,7 @@ def monitor(
     *,
     out: FilePath | None = None,
     log: FilePath | None = None,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> MonitorResult:
     """Has a camera moved since it was calibrated, or during this recording? `result.verdicts` by camera.
 
@@ -440,52 +317,15 @@ def monitor(
     from rigwake.monitor.kept_result import keep_result
     from rigwake.monitor.run import monitor as run
 
-    calibrated, opened = _calibration(calibration), _opened(recording)
-    result = run(calibrated, opened, progress)
+    calibrated, watched = calibration_of(calibration), opened(recording)
+    result = run(calibrated, watched, progress)
     note = Path(calibration).name if isinstance(calibration, str | Path) else ""
     keep_result(
         calibrated,
-        opened,
+        watched,
         result,
         None if out is None else Path(out),
         None if log is None else Path(log),
         note=note,
     )
     return result
-
-
-def _topic_map(
-    topics: Mapping[str, str] | None, camera_files: Mapping[str, FilePath] | None
-) -> TopicMap | None:
-    from rigwake.readers.topics import TopicMap
-
-    if not topics and not camera_files:
-        return None
-    assignments = [f"{sensor}={topic}" for sensor, topic in (topics or {}).items()]
-    files = [f"{camera}={file}" for camera, file in (camera_files or {}).items()]
-    return TopicMap.from_options(assignments, None, files)
-
-
-def _opened(recording: FilePath | Recording) -> Recording:
-    return open_recording(recording) if isinstance(recording, str | Path) else recording
-
-
-def _calibration(calibration: FilePath | Calibration | Trajectory) -> Calibration:
-    from rigwake.calibration import Calibration
-
-    if isinstance(calibration, str | Path):
-        return load_calibration(calibration)
-    if not isinstance(calibration, Calibration):
-        raise InputError("A calibration is wanted, or the path of one.")
-    return calibration
-
-
-def _trajectory(trajectory: FilePath | Trajectory | Calibration) -> Trajectory:
-    from rigwake.readers.trajectories import read_trajectory
-    from rigwake.trajectory import Trajectory
-
-    if isinstance(trajectory, str | Path):
-        return read_trajectory(trajectory).trajectory
-    if not isinstance(trajectory, Trajectory):
-        raise InputError("A trajectory is wanted, or the path of one.")
-    return trajectory

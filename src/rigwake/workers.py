@@ -20,7 +20,7 @@ from rigwake.errors import HostError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-StageProgress = Callable[..., None]
+WorkerReport = Callable[..., None]
 """Told any plain values by a worker; called in the process that started it."""
 
 _LOOK_EVERY_S = 0.2
@@ -31,10 +31,10 @@ _messages: Any = None  # of this worker: where it tells its progress
 
 
 def run_in_processes(
-    work: Callable[[Job, StageProgress], Result],
+    work: Callable[[Job, WorkerReport], Result],
     jobs: Mapping[str, Job],
     processes: int,
-    progress: StageProgress,
+    progress: WorkerReport,
     finished: Callable[[str, Result], None] = lambda name, result: None,
 ) -> dict[str, Result]:
     """`work(job, progress)` of every job by name, in at most so many processes (0: one per core) at a time.
@@ -94,7 +94,7 @@ def _main_module_stays_here() -> Iterator[None]:
 def _follow(
     names: dict[Future[Result], str],
     messages: Any,
-    progress: StageProgress,
+    progress: WorkerReport,
     results: dict[str, Result],
     finished: Callable[[str, Result], None],
 ) -> None:
@@ -108,7 +108,7 @@ def _follow(
             finished(names[future], results[names[future]])
 
 
-def _pass_on(messages: Any, progress: StageProgress) -> None:
+def _pass_on(messages: Any, progress: WorkerReport) -> None:
     with contextlib.suppress(queue.Empty):
         while True:
             progress(*messages.get_nowait())
@@ -159,7 +159,7 @@ def _end_with_parent(parent: int) -> None:
     threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
-def _in_worker(work: Callable[[Job, StageProgress], Result], job: Job) -> Result:
+def _in_worker(work: Callable[[Job, WorkerReport], Result], job: Job) -> Result:
     return work(job, _tell_parent)
 
 

@@ -15,6 +15,7 @@ from rigwake._types import Array
 from rigwake.errors import InputError
 from rigwake.geometry import so3
 from rigwake.geometry.align import Alignment, AlignmentKind, align_points
+from rigwake.geometry.interpolate import nearest_indices
 from rigwake.geometry.se3 import SE3
 from rigwake.trajectory import Trajectory
 
@@ -59,11 +60,8 @@ def associate(
 
     Raises InputError when no stamps lie within `max_difference_s` of each other.
     """
-    after = np.searchsorted(reference.timestamps_ns, estimate.timestamps_ns)
-    candidates = np.stack([np.clip(after - 1, 0, len(reference) - 1), np.clip(after, 0, len(reference) - 1)])
-    gaps = np.abs(reference.timestamps_ns[candidates] - estimate.timestamps_ns)
-    nearest = candidates[np.argmin(gaps, axis=0), np.arange(len(estimate))]
-    gap = gaps.min(axis=0)
+    nearest = nearest_indices(reference.timestamps_ns, estimate.timestamps_ns)
+    gap = np.abs(reference.timestamps_ns[nearest] - estimate.timestamps_ns)
     in_estimate = np.flatnonzero(gap <= max_difference_s * 1e9)
     in_estimate = in_estimate[np.argsort(gap[in_estimate], kind="stable")]
     _, first = np.unique(nearest[in_estimate], return_index=True)
@@ -73,7 +71,7 @@ def associate(
             f"No stamps of {estimate.name} lie within {max_difference_s} s of those of {reference.name}.",
             remedy="Check that both are on the same clock.",
         )
-    return nearest[in_estimate].astype(np.int64), in_estimate.astype(np.int64)
+    return nearest[in_estimate], in_estimate.astype(np.int64)
 
 
 def align(reference: SE3, estimate: SE3, kind: AlignmentKind | None) -> Alignment:

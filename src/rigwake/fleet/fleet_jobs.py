@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,6 @@ FAILED = "failed"
 
 # causes of failures that whoever watches over the work finds out
 TIME_OUT, OUT_OF_MEMORY, KILLED = "time-out", "out of memory", "killed"
-
-FleetProgress = Callable[[str, str, float], None]
 
 
 @dataclass(frozen=True)

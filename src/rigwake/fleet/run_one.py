@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from rigwake import __version__
+from rigwake._progress import Progress
 from rigwake.atomic import write_text_atomic
 from rigwake.calibration import Calibration, load_calibration
 from rigwake.config import CalibrateConfig
@@ -29,7 +30,6 @@ from rigwake.fleet.fleet_jobs import (
     OUT_OF_MEMORY,
     FleetJob,
     FleetOutcome,
-    FleetProgress,
     failure,
     outcome_of,
 )
@@ -51,7 +51,7 @@ def _silent(name: str, what: str, fraction: float) -> None:
     """Progress that nobody asked for."""
 
 
-def run_one(job: FleetJob, progress: FleetProgress = _silent) -> FleetOutcome:
+def run_one(job: FleetJob, progress: Progress = _silent) -> FleetOutcome:
     """Do the job; every error becomes an outcome. Writes nothing outside of the job's two folders.
 
     The result appears in `job.result_folder` when it is whole. A failure of the recording is kept there as well; one of
@@ -92,7 +92,7 @@ def check_machine(job: FleetJob) -> None:
         )
 
 
-def _worked(job: FleetJob, progress: FleetProgress, begun: float) -> FleetOutcome:
+def _worked(job: FleetJob, progress: Progress, begun: float) -> FleetOutcome:
     progress(job.name, "reading", 0.0)
     if not Path(job.recording).exists():
         raise FileNotFoundError(errno.ENOENT, "No such file", job.recording)
@@ -136,7 +136,7 @@ def _used_when_free(job: FleetJob) -> Iterator[None]:
         job.working_folder.rmdir()
 
 
-def _calibrated(job: FleetJob, folder: Path, progress: FleetProgress) -> FleetOutcome:
+def _calibrated(job: FleetJob, folder: Path, progress: Progress) -> FleetOutcome:
     settings = CalibrateConfig.model_validate(json.loads(job.settings)).model_copy(update={"jobs": 1})
     topics = topics_of(job)
     run = calibrate(job.recording, folder, settings, topics=topics, resume=True, progress=progress)
@@ -173,7 +173,7 @@ def _numbers(values: Any) -> list[float | None]:
     return [float(v) if math.isfinite(v) else None for v in np.asarray(values, dtype=np.float64)]
 
 
-def _monitored(job: FleetJob, folder: Path, progress: FleetProgress) -> FleetOutcome:
+def _monitored(job: FleetJob, folder: Path, progress: Progress) -> FleetOutcome:
     from rigwake.monitor.monitor_report import result_to_dict
     from rigwake.monitor.run import monitor
 

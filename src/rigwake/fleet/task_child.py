@@ -17,7 +17,8 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from rigwake.fleet.fleet_jobs import FleetJob, FleetOutcome, FleetProgress
+from rigwake._progress import Progress
+from rigwake.fleet.fleet_jobs import FleetJob, FleetOutcome
 
 _SEND_EVERY = 0.02  # of a fraction
 
@@ -56,11 +57,9 @@ def _end_first() -> None:
         file.write("1000")
 
 
-def _work_named(name: str) -> Callable[[FleetJob, FleetProgress], FleetOutcome]:
+def _work_named(name: str) -> Callable[[FleetJob, Progress], FleetOutcome]:
     module, _, function = name.partition(":")
-    work: Callable[[FleetJob, FleetProgress], FleetOutcome] = getattr(
-        importlib.import_module(module), function
-    )
+    work: Callable[[FleetJob, Progress], FleetOutcome] = getattr(importlib.import_module(module), function)
     return work
 
 

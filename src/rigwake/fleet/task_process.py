@@ -20,6 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
+from rigwake._progress import Progress
 from rigwake.errors import RigwakeError
 from rigwake.fleet.fleet_jobs import (
     KILLED,
@@ -27,7 +28,6 @@ from rigwake.fleet.fleet_jobs import (
     TIME_OUT,
     FleetJob,
     FleetOutcome,
-    FleetProgress,
     failure,
 )
 
@@ -53,13 +53,13 @@ class TaskProcess:
         """Of the process, if it runs."""
         return None if self._process is None else self._process.pid
 
-    def attend(self, job: FleetJob, progress: FleetProgress = _silent) -> FleetOutcome:
+    def attend(self, job: FleetJob, progress: Progress = _silent) -> FleetOutcome:
         """What comes of the job. Loss of the process, time-out and memory become outcomes that are not yet stored."""
         begun = time.monotonic()
         outcome = self._attended(job, progress)
         return replace(outcome, seconds=outcome.seconds or round(time.monotonic() - begun, 3))
 
-    def _attended(self, job: FleetJob, progress: FleetProgress) -> FleetOutcome:
+    def _attended(self, job: FleetJob, progress: Progress) -> FleetOutcome:
         if not self._running():
             self._start()
         assert self._process is not None

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from rigwake._types import Array, Stamps
+from rigwake._types import Array, Indices, Stamps
 from rigwake.errors import InputError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
@@ -82,3 +83,10 @@ class TransformSpline:
     def angular_rate_body(self, at_ns: Stamps) -> Array:
         """(M, 3) angular rates in body axes, radians per second."""
         return np.asarray(self._curves[1](self._times(at_ns), 1))
+
+
+def nearest_indices(times: NDArray[Any], at: NDArray[Any]) -> Indices:
+    """(n,) index of the time (N,), in rising order, nearest to each of `at` (n,); the later one of two alike."""
+    after = np.minimum(np.searchsorted(times, at), len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(at - times[before] < times[after] - at, before, after).astype(np.int64)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from rigwake._progress import CountProgress
 from rigwake.inspection.picture_samples import Pictures, look_at_pictures, sampled_indices
 from rigwake.inspection.time_offsets import SensorTimeOffset, camera_offset, gnss_offset
 from rigwake.inspection.timing import Timing, timing
@@ -16,9 +17,6 @@ from rigwake.recording import Finding, GnssStream, ImuStream, Recording, main_gn
 
 MIN_MOTION_SAMPLES = 50
 _GRAVITY_RANGE = (8.5, 11.0)
-
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, frames done, frames in all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +36,7 @@ class Inspection:
     findings: tuple[Finding, ...]
 
 
-def inspect_recording(recording: Recording, progress: Progress | None = None) -> Inspection:
+def inspect_recording(recording: Recording, progress: CountProgress | None = None) -> Inspection:
     """Inspect a recording: stamps of everything, a few dozen sampled frames of each camera."""
     report = progress or (lambda *_: None)
     timings = {key: timing(stream.timestamps_ns) for key, stream in sensors(recording).items()}
@@ -66,7 +64,7 @@ def sensors(recording: Recording) -> dict[str, Any]:
     return {f"{kind}.{name}": stream for kind, streams in kinds.items() for name, stream in streams.items()}
 
 
-def _pictures(recording: Recording, report: Progress) -> dict[str, Pictures]:
+def _pictures(recording: Recording, report: CountProgress) -> dict[str, Pictures]:
     total = sum(len(burst) for c in recording.cameras.values() for burst in sampled_indices(len(c)))
     done = 0
     pictures = {}

@@ -14,6 +14,7 @@ from rigwake.intrinsics.board_adjustment import BoardEstimate, adjust, residuals
 from rigwake.intrinsics.board_calibration import MIN_VIEWS, calibrate
 from rigwake.intrinsics.board_observations import BoardObservations
 from rigwake.intrinsics.initial_guess import stacked, view_pose
+from rigwake.robust import robust_std
 
 CANDIDATES = ("pinhole", "kb4", "eucm", "ds", "fov", "mei", "scaramuzza", "rational")
 _FOLDS = 5
@@ -83,7 +84,7 @@ def _score(observations: BoardObservations, model: str, folds: int) -> ModelScor
         errors += _held_out_errors(result.camera, observations.take(np.flatnonzero(held_out)))
     if not errors:
         return ModelScore(model, np.inf, np.inf, free_count, failure="it sees no held-out view")
-    spread = 1.4826 * float(np.median(np.abs(np.array(errors) - np.median(errors))))
+    spread = robust_std(np.array(errors) - np.median(errors))
     return ModelScore(model, float(np.median(errors)), spread / np.sqrt(len(errors)), free_count)
 
 

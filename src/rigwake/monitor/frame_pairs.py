@@ -9,6 +9,7 @@ import numpy as np
 
 from rigwake._types import Array, Indices
 from rigwake.cameras.protocol import CameraModel
+from rigwake.geometry.interpolate import nearest_indices
 from rigwake.rig import Rig
 from rigwake.tracks import Tracks
 
@@ -116,10 +117,9 @@ def _pairs_of(tracks: Tracks, rig: Rig, begin_ns: int, end_ns: int, stride: int)
 def _partners(stamps_ns: Indices) -> Indices:
     """(F,) the frame nearest to a second after each, -1 if there is none near."""
     wanted = stamps_ns + round(PAIR_S * 1e9)
-    after = np.clip(np.searchsorted(stamps_ns, wanted), 1, max(len(stamps_ns) - 1, 1))
     if len(stamps_ns) < 2:
         return np.full(len(stamps_ns), -1)
-    nearest = np.where(wanted - stamps_ns[after - 1] < stamps_ns[after] - wanted, after - 1, after)
+    nearest = nearest_indices(stamps_ns, wanted)
     late = np.abs(stamps_ns[nearest] - wanted) > _TOLERANCE_S * 1e9
     return np.where(late | (nearest <= np.arange(len(stamps_ns))), -1, nearest)
 

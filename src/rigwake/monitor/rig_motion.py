@@ -13,6 +13,7 @@ from rigwake.geometry import so3
 from rigwake.odometry.gyro import integrate_gyro
 from rigwake.odometry.imu_alignment import with_noise
 from rigwake.recording import GnssStream, ImuStream
+from rigwake.robust import robust_std
 
 _GRAVITY_WINDOW_S = 60.0  # a vessel's velocity changes by a few m/s at most: 0.07 m/s^2 of the mean force
 _BIAS_WINDOW_S, _BIAS_MEAN_S = 120.0, 10.0
@@ -248,7 +249,7 @@ def _distances(gnss: GnssStream | None, antenna_rig: Array | None) -> GnssDistan
     if gnss is None or len(gnss.timestamps_ns) < 10:
         return None
     jitter = np.diff(gnss.position_enu, n=2, axis=0) / np.sqrt(6)
-    white = 1.4826 * float(np.median(np.abs(jitter)))
+    white = robust_std(jitter)
     std = max(np.sqrt(2) * white, _LEAST_DISTANCE_STD_M)
     lever = np.zeros(3) if antenna_rig is None else np.asarray(antenna_rig, dtype=np.float64)
     return GnssDistances(gnss.timestamps_ns, gnss.position_enu, lever, std)

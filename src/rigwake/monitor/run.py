@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from rigwake._progress import Progress
 from rigwake._types import Array, Indices
 from rigwake.calibration import Calibration
 from rigwake.errors import EstimationError, UnobservableError
@@ -28,9 +29,6 @@ from rigwake.tracking.masks import lens_mask
 from rigwake.tracking.self_mask import find_self_mask
 from rigwake.tracking.tracking_options import TrackingOptions
 from rigwake.tracks import Tracks
-
-Progress = Callable[[str, str, float], None]
-"""Told a camera (or `monitor`), what is being done, and which fraction of it is done."""
 
 _FEWEST_BLOCKS = 2
 _REFINE_ROUNDS = 3

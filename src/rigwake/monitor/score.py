@@ -21,6 +21,7 @@ from rigwake.monitor.pair_kernels import COLUMNS, MOUNTING, accumulate, pair_res
 from rigwake.monitor.rig_motion import PairMotion, RigMotion
 from rigwake.monitor.velocity import Slots, VelocityPriors, slots_of, solve_velocities, without_slow
 from rigwake.rig import Rig
+from rigwake.robust import MAD_TO_STD
 from rigwake.tracks import Tracks
 
 BLOCK_S = 10.0
@@ -32,7 +33,6 @@ _LARGEST_NOISE = 30.0
 _BIAS_START_STD, _BIAS_AGAIN_STD, _BIAS_LEAST_STD = 5e-3, 1e-3, 1e-4  # rad/s
 _NUISANCES = 6  # of a slot: rotation and velocity of the rig
 _SECTORS = 4  # of the image, around the optical axis
-_MAD_TO_STD = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +276,7 @@ def _noise(residual: Array, pairs: EpipolarPairs) -> Array:
     for k in range(len(scale)):
         of_camera = np.abs(residual[camera == k])
         if len(of_camera):
-            scale[k] = np.clip(_MAD_TO_STD * float(np.median(of_camera)), 0.5, _LARGEST_NOISE)
+            scale[k] = np.clip(MAD_TO_STD * float(np.median(of_camera)), 0.5, _LARGEST_NOISE)
     return scale
 
 

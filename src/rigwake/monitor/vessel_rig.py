@@ -16,7 +16,15 @@ from rigwake.logbook.vessel_fingerprint import (
     fingerprint_of_calibration,
     fingerprint_of_recording,
 )
-from rigwake.recording import CameraStream, GnssStream, ImuStream, Recording, static_transform
+from rigwake.recording import (
+    CameraStream,
+    GnssStream,
+    ImuStream,
+    Recording,
+    main_gnss,
+    main_imu,
+    static_transform,
+)
 from rigwake.rig import Rig, RigCamera
 
 _TOO_FEW = 2
@@ -50,14 +58,13 @@ def prepare_rig(calibration: Calibration, recording: Recording) -> MonitoredRig:
     camera only.
     """
     require_same_vessel(fingerprint_of_calibration(calibration), fingerprint_of_recording(recording))
-    if not recording.imus:
+    imu, gnss = main_imu(recording), main_gnss(recording)
+    if imu is None:
         raise InputError(
             f"{recording.path.name} has no IMU.",
             consequence="Without the rig's turns a camera cannot be tested against them.",
             remedy="Record the IMU, or name it with --topic imu=/TOPIC.",
         )
-    imu = max(recording.imus.values(), key=lambda stream: len(stream.timestamps_ns))
-    gnss = max(recording.gnss.values(), key=lambda stream: len(stream.timestamps_ns), default=None)
     if len(imu.timestamps_ns) < 2 or np.any(np.diff(imu.timestamps_ns) <= 0):
         raise InputError(
             f"The clock of {imu.name} stands still or runs back.",

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from rigwake._progress import CountProgress
 from rigwake._types import Array
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import EstimationError, UnobservableError, UsageError
 from rigwake.odometry.below_horizon import HorizonChoice
 from rigwake.odometry.bridged import bridged
 from rigwake.odometry.loop_closure import closed_path, find_loops, joined_tracks
-from rigwake.odometry.measure import Progress, measure_camera
+from rigwake.odometry.measure import measure_camera
 from rigwake.odometry.metric import MetricStart, metric_start
 from rigwake.odometry.monocular import estimate_monocular, readjust
 from rigwake.odometry.odometry_options import OdometryOptions
@@ -80,7 +81,7 @@ def run_camera(
     imu: ImuStream | None = None,
     gnss: GnssStream | None = None,
     options: CameraOdometryOptions | None = None,
-    progress: Progress | None = None,
+    progress: CountProgress | None = None,
     attitude: AttitudeStream | None = None,
 ) -> CameraOdometry:
     """Masks, tracks, visual odometry and, with an IMU or GNSS, the metric smoother.
@@ -108,7 +109,7 @@ class _OdometryRun:
         gnss: GnssStream | None,
         attitude: AttitudeStream | None,
         options: CameraOdometryOptions,
-        progress: Progress,
+        progress: CountProgress,
     ) -> None:
         assert stream.model is not None
         self.stream, self.model = stream, stream.model

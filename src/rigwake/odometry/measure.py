@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from rigwake._progress import CountProgress
 from rigwake._types import Array
 from rigwake.errors import EstimationError, UnobservableError
 from rigwake.odometry.below_horizon import HorizonChoice, look_below_horizon
@@ -23,9 +23,6 @@ from rigwake.tracking.self_mask import find_self_mask
 from rigwake.tracking.tracking_options import TrackingOptions
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
-
-Progress = Callable[[str, int, int], None]
-"""Told a stage, and how much of it is done of how much in all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +41,7 @@ def measure_camera(
     stream: CameraStream,
     imu: ImuStream | None,
     tracking: TrackingOptions,
-    progress: Progress,
+    progress: CountProgress,
     *,
     hull: bool = True,
     horizon: HorizonChoice = "auto",

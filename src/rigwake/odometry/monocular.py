@@ -22,7 +22,6 @@ from rigwake.odometry.visual_map import VisualMap
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
-Progress = Callable[[int], None]
 _MIN_SEGMENT = 5  # frames
 _WIDE = 4.0  # times the gate, where poses are only nearly right
 
@@ -33,7 +32,7 @@ def estimate_monocular(
     options: OdometryOptions | None = None,
     *,
     rotations: Array | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> OdometryResult:
     """The camera's motion and a map of points from tracks alone, up to scale.
 
@@ -87,7 +86,11 @@ class _Builder:
     """Grows a map segment by segment."""
 
     def __init__(
-        self, visual_map: VisualMap, camera: CameraModel, rotations: Array | None, progress: Progress | None
+        self,
+        visual_map: VisualMap,
+        camera: CameraModel,
+        rotations: Array | None,
+        progress: Callable[[int], None] | None,
     ) -> None:
         self.map = visual_map
         self.camera = camera

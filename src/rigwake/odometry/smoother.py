@@ -25,7 +25,6 @@ from rigwake.ba.solver.rig_problem import (
     SolverOptions,
     States,
 )
-from rigwake.ba.solver.robust_loss import MAD_TO_STD
 from rigwake.ba.solver.state_motion import nearest_states, rig_at, seconds_since_start
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import EstimationError
@@ -38,6 +37,7 @@ from rigwake.odometry.imu_alignment import with_noise
 from rigwake.odometry.metric import MetricStart
 from rigwake.odometry.result import OdometryResult
 from rigwake.recording import AttitudeStream, GnssStream, ImuStream
+from rigwake.robust import robust_std
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
@@ -242,7 +242,7 @@ def _reweighted(rough: RigSolution) -> tuple[RigProblem, float]:
     observations = rough.problem.observations
     whitened = rough.residuals_px / observations.std_px[:, None]
     valid = np.isfinite(whitened).all(axis=1)
-    factor = max(MAD_TO_STD * float(np.median(np.abs(whitened[valid]))), 1e-3)
+    factor = max(robust_std(whitened[valid]), 1e-3)
     kept = valid & (np.linalg.norm(np.nan_to_num(whitened), axis=1) <= _GATE_STDS * factor)
     counts = np.bincount(observations.landmark_indices[kept], minlength=len(rough.problem.landmarks))
     kept &= counts[observations.landmark_indices] >= _MIN_VIEWS

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from rigwake import __version__
-from rigwake.ba.rig.initialisation import InitialRig
+from rigwake._progress import Progress
+from rigwake.ba.rig.rig_values import InitialRig
 from rigwake.calibration import Calibration, save_calibration
 from rigwake.config import CalibrateConfig
 from rigwake.errors import InputError, UnobservableError
@@ -23,7 +24,7 @@ from rigwake.pipeline.before_start import (
     without_cameras,
 )
 from rigwake.pipeline.camera_key import camera_key
-from rigwake.pipeline.camera_processes import CameraRunner, Progress, process_cameras
+from rigwake.pipeline.camera_processes import CameraRunner, process_cameras
 from rigwake.pipeline.camera_stage import (
     CameraJob,
     CameraOutcome,

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from rigwake._progress import Progress
 from rigwake.pipeline.camera_stage import CameraJob, CameraOutcome, process_camera
-from rigwake.workers import StageProgress, run_in_processes
-
-Progress = Callable[[str, str, float], None]
-"""Told a camera's name, what it is doing, and which fraction of it is done."""
+from rigwake.workers import WorkerReport, run_in_processes
 
 Finished = Callable[[CameraOutcome], None]
 CameraRunner = Callable[[Sequence[CameraJob], int, Progress, Finished], list[CameraOutcome]]
@@ -20,7 +18,7 @@ _SEND_EVERY = 0.01  # of a fraction
 class _ProgressSender:
     """Passes progress on, but not every frame of it."""
 
-    def __init__(self, name: str, report_stage: StageProgress) -> None:
+    def __init__(self, name: str, report_stage: WorkerReport) -> None:
         self.name = name
         self.report_stage = report_stage
         self.last = ("", -1.0)
@@ -31,7 +29,7 @@ class _ProgressSender:
             self.report_stage(self.name, what, fraction)
 
 
-def _work(job: CameraJob, report_stage: StageProgress) -> CameraOutcome:
+def _work(job: CameraJob, report_stage: WorkerReport) -> CameraOutcome:
     return process_camera(job, _ProgressSender(job.stream.name, report_stage))
 
 

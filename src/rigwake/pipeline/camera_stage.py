@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 import traceback
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from rigwake._progress import StageProgress
 from rigwake.atomic import write_text_atomic
 from rigwake.calibration.yaml_file import plain
 from rigwake.config import CalibrateConfig
@@ -22,9 +22,6 @@ from rigwake.odometry.monocular import estimate_monocular
 from rigwake.recording import CameraStream, ImuStream
 from rigwake.trajectory import Trajectory
 from rigwake.writers.trajectory_writer import write_tum
-
-StageProgress = Callable[[str, float], None]
-"""Told what is being done and which fraction of it is done."""
 
 
 @dataclass(frozen=True, eq=False)

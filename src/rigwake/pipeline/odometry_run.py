@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import cv2
 
+from rigwake._progress import Progress
 from rigwake.errors import HostError, InputError, RigwakeError, UsageError
 from rigwake.fingerprint import unchanged
 from rigwake.odometry.camera_odometry import CameraOdometry, CameraOdometryOptions, run_camera
@@ -29,7 +30,7 @@ from rigwake.recording import (
 from rigwake.rig import Rig
 from rigwake.tracking.front_ends import track_camera
 from rigwake.trajectory import Trajectory
-from rigwake.workers import StageProgress, run_in_processes
+from rigwake.workers import WorkerReport, run_in_processes
 from rigwake.writers.trajectory_writer import write_tum
 
 
@@ -83,7 +84,7 @@ def run_odometry(
     attitude: bool = True,
     repair: bool = True,
     jobs: int = 0,
-    progress: StageProgress = lambda name, what, fraction: None,
+    progress: Progress = lambda name, what, fraction: None,
     checked: Callable[[tuple[SensorCheck, ...]], None] = lambda checks: None,
 ) -> OdometryRun:
     """Trajectories of one camera or of all; writes NAME.tum, tracks and masks of those that have one into `out`.
@@ -177,7 +178,7 @@ def _outcome(result: CameraOdometry | None, failure: _Failure | None) -> CameraO
     return error
 
 
-def _in_process(job: _OdometryJob, progress: StageProgress) -> tuple[CameraOdometry | None, _Failure | None]:
+def _in_process(job: _OdometryJob, progress: WorkerReport) -> tuple[CameraOdometry | None, _Failure | None]:
     """One camera; an error travels between processes as its words, since exceptions pickle only their message."""
     cv2.setNumThreads(1)  # the processes share the processors already
     stream, sensors, options = job

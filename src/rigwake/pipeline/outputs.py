@@ -13,8 +13,7 @@ import numpy as np
 from rigwake._types import Array, Image
 from rigwake.atomic import atomic_path, write_text_atomic
 from rigwake.ba.rig.association_rounds import CrossCameraMatches
-from rigwake.ba.rig.initialisation import InitialRig
-from rigwake.ba.rig.rig_values import AdjustedRig
+from rigwake.ba.rig.rig_values import AdjustedRig, InitialRig
 from rigwake.ba.rig.search_proposals import camera_from_world
 from rigwake.ba.solver.rig_problem import RigProblem
 from rigwake.calibration import Calibration, save_calibration

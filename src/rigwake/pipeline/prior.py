@@ -20,7 +20,7 @@ import numpy as np
 
 from rigwake._types import Array
 from rigwake.ba.rig.gauge import with_gauge
-from rigwake.ba.rig.initialisation import InitialRig
+from rigwake.ba.rig.rig_values import InitialRig
 from rigwake.ba.solver.rig_problem import (
     BundleCamera,
     CameraDistance,
@@ -67,7 +67,7 @@ class RigPrior:
     def applied_to(self, first: InitialRig, config: CalibrateConfig) -> InitialRig:
         """Initial values with these priors, with the scale of a known baseline if there is no other, and with what
         the settings hold fixed. Raises UsageError for cameras that are not there."""
-        cameras = dict(first.start.cameras)
+        cameras = dict(first.cameras)
         for name in self.cameras:
             if name not in cameras:
                 raise UsageError(
@@ -75,10 +75,10 @@ class RigPrior:
                 )
         if first.scale_source == "none" and self.baselines:
             first = _scaled(first, self.baselines)
-            cameras = dict(first.start.cameras)
+            cameras = dict(first.cameras)
         for name, camera in cameras.items():
             cameras[name] = _prepared(camera, self.cameras.get(name), config)
-        return replace(first, start=replace(first.start, cameras=cameras))
+        return replace(first, cameras=cameras)
 
     def constrained(self, problem: RigProblem) -> RigProblem:
         """The problem with what is known of antenna and baselines, and with the gauge held that nothing determines."""
@@ -120,7 +120,7 @@ def _aboard(camera: BundleCamera) -> PosePrior | None:
 
 def _scaled(first: InitialRig, baselines: tuple[Baseline, ...]) -> InitialRig:
     """Everything in metres, by the ratio of the known to the estimated baselines."""
-    cameras, ratios = first.start.cameras, []
+    cameras, ratios = first.cameras, []
     for baseline in baselines:
         if baseline.first in cameras and baseline.second in cameras:
             a, b = cameras[baseline.first].rig_from_cam, cameras[baseline.second].rig_from_cam
@@ -133,14 +133,14 @@ def _scaled(first: InitialRig, baselines: tuple[Baseline, ...]) -> InitialRig:
         return SE3(x.rotation, scale * x.translation)
 
     trajectory: Trajectory = replace(
-        first.start.world_from_rig, world_from_body=grown(first.start.world_from_rig.world_from_body)
+        first.world_from_rig, world_from_body=grown(first.world_from_rig.world_from_body)
     )
-    start = replace(
-        first.start,
+    return replace(
+        first,
         world_from_rig=trajectory,
         cameras={name: replace(c, rig_from_cam=grown(c.rig_from_cam)) for name, c in cameras.items()},
+        scale_source="baseline",
     )
-    return replace(first, start=start, scale_source="baseline")
 
 
 def load_prior(path: Path | str) -> RigPrior:

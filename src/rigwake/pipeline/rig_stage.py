@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rigwake._progress import StageProgress
 from rigwake.ba.rig.assemble_problem import assemble_problem
 from rigwake.ba.rig.association_rounds import CrossCameraMatches, adjust_with_association
 from rigwake.ba.rig.imu_noise import imu_noise_factors
-from rigwake.ba.rig.initialisation import InitialRig, initial_rig
+from rigwake.ba.rig.initialisation import initial_rig
 from rigwake.ba.rig.intrinsics_refinement import (
     FIRMLY,
     JUDGED,
@@ -25,7 +26,7 @@ from rigwake.ba.rig.intrinsics_refinement import (
     with_intrinsics_priors_of,
 )
 from rigwake.ba.rig.outlier_rounds import SETTLED, adjust
-from rigwake.ba.rig.rig_values import AdjustedRig, RigMeasurements
+from rigwake.ba.rig.rig_values import AdjustedRig, InitialRig, RigMeasurements
 from rigwake.ba.rig.rig_verdicts import ReferenceFrame, calibrated_cameras
 from rigwake.ba.rig.split_checks import (
     association_errors,
@@ -49,8 +50,6 @@ from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
 _MISFIT_PX, _MISFIT_FACTOR = 3.0, 8.0  # residuals beyond both are no noise
-StageProgress = Callable[[str, float], None]
-"""Told what is being done and which fraction of it is done."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +99,7 @@ def estimate_rig(
     determines nothing, EstimationError when no trustworthy answer was found.
     """
     measurements = RigMeasurements(
-        {name: tracks[name] for name in first.start.cameras}, selection.imu, selection.gnss
+        {name: tracks[name] for name in first.cameras}, selection.imu, selection.gnss
     )
     adjusted, matches = _adjust(measurements, first, prior, selection, config, masks, progress)
     progress("checking", 0.8)
@@ -131,7 +130,7 @@ def _adjust(
     progress: StageProgress,
 ) -> tuple[AdjustedRig, CrossCameraMatches]:
     """The rig bundle adjustment: alone first, then with landmarks associated across cameras and times."""
-    assembled = assemble_problem(measurements, first.start, config.adjustment)
+    assembled = assemble_problem(measurements, first, config.adjustment)
     believed = _with_intrinsics(prior.constrained(assembled.problem), selection, config)
     assembled = replace(assembled, problem=believed)
     progress(f"adjusting {len(assembled.problem.observations)} observations", 0.0)

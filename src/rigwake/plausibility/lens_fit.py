@@ -17,6 +17,7 @@ from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import EstimationError
 from rigwake.geometry import so3
 from rigwake.geometry.interpolate import interpolate
+from rigwake.robust import robust_std
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
@@ -152,7 +153,7 @@ def _minimise(pairs: _Pairs, model: CameraModel) -> LensFit:
     cost_before, state = np.inf, (R, t, lens)
     for done in range(_ROUNDS):
         error, J_pose, J_lens = _linearise(pairs, model, centre, R, t, lens, steps)
-        size = 1.4826 * float(np.median(np.abs(error)))
+        size = robust_std(error)
         if done == 0:
             size *= 3  # the start is still in the residuals
         scale = max(size, 1e-7)
@@ -165,7 +166,7 @@ def _minimise(pairs: _Pairs, model: CameraModel) -> LensFit:
             continue
         state, cost_before = (R, t, lens), cost
         if done <= 3:
-            given_rms = float(1.4826 * np.median(np.abs(error)))
+            given_rms = robust_std(error)
         reduced, right, back = _eliminate(pairs, error, J_pose, J_lens, weights, damping)
         prior = (scale**2) / np.array([0.2, 0.2 * focal, 0.2 * focal]) ** 2
         if done < 3:  # poses first, with the lens given
@@ -186,7 +187,7 @@ def _minimise(pairs: _Pairs, model: CameraModel) -> LensFit:
     covariance = _scatter(pairs, error, J_pose, J_lens, weights, reduced)
     covariance[0] *= np.exp(lens[0])
     covariance[:, 0] *= np.exp(lens[0])
-    refined = 1.4826 * float(np.median(np.abs(error)))
+    refined = robust_std(error)
     return LensFit(
         float(np.exp(lens[0])), lens[1:].copy(), covariance, given_rms * focal, refined * focal, len(R)
     )

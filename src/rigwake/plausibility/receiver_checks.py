@@ -12,6 +12,7 @@ from rigwake.errors import UnobservableError
 from rigwake.plausibility.receiver_fit import ReceiverFit, axis_confusions, fit_receiver, frozen_rows
 from rigwake.plausibility.values import SensorCheck
 from rigwake.recording import GnssStream
+from rigwake.robust import robust_std
 from rigwake.trajectory import Trajectory
 
 _DRIFT = 0.01  # of the path: what a camera's own path may be off
@@ -179,7 +180,7 @@ def _without_standing(
 def _white_noise(gnss: GnssStream) -> float:
     """Standard deviation per axis of what changes from fix to fix, by third differences, metres."""
     third = np.diff(gnss.position_enu[:, :2], n=3, axis=0)
-    return 1.4826 * float(np.median(np.abs(third))) / np.sqrt(20.0) if len(third) else 0.0
+    return robust_std(third) / np.sqrt(20.0) if len(third) else 0.0
 
 
 def _reduced(
@@ -219,7 +220,7 @@ def _without_jumps(
     # a vessel's velocity changes by little from fix to fix; noise is in the median
     nearby = np.array([np.median(velocity[max(k - 4, 0) : k + 5], axis=0) for k in range(len(steps))])
     excess = np.linalg.norm(steps - nearby * seconds, axis=1)
-    noise = 1.4826 * float(np.median(np.abs(excess - np.median(excess))))
+    noise = robust_std(excess - np.median(excess))
     limit = max(_LEAST_JUMP_M, _JUMP_STDS * noise)
     jumps = np.flatnonzero(excess > limit)
     if not len(jumps):

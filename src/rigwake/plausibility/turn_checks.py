@@ -12,6 +12,7 @@ from rigwake._types import Array
 from rigwake.geometry import so3
 from rigwake.plausibility.turn_fit import TurnFit, rotation_between
 from rigwake.plausibility.values import SensorCheck
+from rigwake.robust import robust_std
 
 _EXPLAINED = 0.15
 _SCALE = 0.01
@@ -170,7 +171,7 @@ def _misfit(turns: Array, gyro: Array, noise: float, *, biased: bool = False) ->
 
 def _rotation_std(turns: Array, gyro: Array, X: Array) -> float:
     off = turns @ X.T - gyro
-    noise = 1.4826 * float(np.median(np.abs(off)))
+    noise = robust_std(off)
     moment = np.einsum("ni,nj->ij", gyro, gyro)
     information = np.trace(moment) * np.eye(3) - moment  # of a rotation that is told by how it turns vectors
     return float(noise / np.sqrt(max(float(np.linalg.eigvalsh(information)[0]), 1e-12)))

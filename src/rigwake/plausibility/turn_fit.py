@@ -18,6 +18,7 @@ from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.odometry.gyro import integrate_gyro
 from rigwake.recording import ImuStream
+from rigwake.robust import robust_std
 from rigwake.sync import estimate_time_offset
 from rigwake.trajectory import Trajectory
 
@@ -61,7 +62,7 @@ class TurnFit:
     @property
     def rms(self) -> float:
         """Robust size of a residual per axis, radians."""
-        return 1.4826 * float(np.median(np.abs(self.residuals)))
+        return robust_std(self.residuals)
 
     @property
     def unexplained(self) -> float:
@@ -184,7 +185,7 @@ def _minimise(strides: _Strides, imu: ImuStream, offset_s: float) -> TurnFit:
     error = residuals(x, X)
     covariance = _clustered(_derivatives(residuals, x, X), error, weights, information + np.diag(prior))
     weakest = float(np.linalg.eigvalsh(information[:3, :3])[0])
-    rotation_std = 1.4826 * float(np.median(np.abs(error))) / np.sqrt(max(weakest, 1e-12))
+    rotation_std = robust_std(error) / np.sqrt(max(weakest, 1e-12))
     return TurnFit(
         X, x[3:6], float(x[6]), float(np.exp(x[7])), float(x[8]), covariance, rotation_std, error, rotations_cam,
         strides.start_ns, strides.end_ns, strides.segments,

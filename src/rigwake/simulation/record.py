@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from rigwake._progress import CountProgress
 from rigwake._types import Floats
 from rigwake.atomic import atomic_path
 from rigwake.geometry.se3 import SE3
@@ -24,7 +24,6 @@ from rigwake.simulation.scenery import KeepClear, Scenery, build_scenery
 from rigwake.simulation.sea_surface import Water
 from rigwake.simulation.setup import Simulation, build_recording
 
-Progress = Callable[[str, int, int], None]
 _RENDERER = 2  # one more whenever the same scenario gives other pictures
 
 
@@ -45,7 +44,7 @@ def work_folder(output: Path, scenario: Scenario) -> Path:
 
 
 def render_recording(
-    simulation: Simulation, renderer: Renderer, work: Path, *, workers: int, progress: Progress
+    simulation: Simulation, renderer: Renderer, work: Path, *, workers: int, progress: CountProgress
 ) -> Recording:
     """Render all frames that are not yet in `work`, then return the recording that reads them from there.
 

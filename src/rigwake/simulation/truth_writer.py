@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 import yaml
 
+from rigwake._progress import CountProgress
 from rigwake._types import Array
 from rigwake.atomic import atomic_path, write_text_atomic
 from rigwake.geometry.se3 import SE3
-from rigwake.simulation.record import Progress, SeaCache, Shot
+from rigwake.simulation.record import SeaCache, Shot
 from rigwake.simulation.render import Renderer
 from rigwake.simulation.setup import Simulation, camera_topic, true_trajectories
 from rigwake.writers.trajectory_writer import write_tum
@@ -91,7 +92,9 @@ def write_truth(simulation: Simulation, known_points_world: Array, folder: Path)
         write_tum(trajectory, folder / ("truth_base.tum" if name == "rig" else f"truth_cam_{name}.tum"))
 
 
-def write_truth_images(simulation: Simulation, renderer: Renderer, folder: Path, progress: Progress) -> None:
+def write_truth_images(
+    simulation: Simulation, renderer: Renderer, folder: Path, progress: CountProgress
+) -> None:
     """Write what each pixel's centre sees of every frame: `labels/NAME/STAMP.png`, `ranges/NAME/STAMP.png`."""
     shots = [
         Shot.prepare(simulation, renderer, i, samples=1) for i in range(len(simulation.scenario.cameras))

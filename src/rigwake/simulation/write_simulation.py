@@ -5,8 +5,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from rigwake._progress import CountProgress
 from rigwake.recording import Finding, Recording
-from rigwake.simulation.record import Progress, build_world, render_recording, work_folder
+from rigwake.simulation.record import build_world, render_recording, work_folder
 from rigwake.simulation.scenario import Scenario
 from rigwake.simulation.setup import prepare
 from rigwake.simulation.truth_writer import write_truth, write_truth_images
@@ -14,7 +15,7 @@ from rigwake.writers.write import write_recording
 
 
 def write_simulation(
-    scenario: Scenario, output: Path, *, workers: int, truth_images: bool, progress: Progress
+    scenario: Scenario, output: Path, *, workers: int, truth_images: bool, progress: CountProgress
 ) -> tuple[Recording, tuple[Finding, ...]]:
     """Render and write everything, the truth into `output`_truth/; what was rendered survives an interruption."""
     simulation = prepare(scenario)

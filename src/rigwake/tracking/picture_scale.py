@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rigwake._types import Array, Image, Mask
 from rigwake.cameras.protocol import CameraModel
 from rigwake.recording import CameraStream
+from rigwake.robust import robust_std
 from rigwake.tracking.features import detect_corners
 
 MOST_OCTAVES = 2
@@ -92,7 +93,7 @@ def noise_std(image: Image) -> float:
     """Standard deviation of independent noise in an image, grey levels, by the median of what a doubled second
     difference leaves of it (Immerkaer 1996); fine texture adds to it where it covers most of the picture."""
     left = cv2.filter2D(image.astype(np.float32), -1, _LAPLACIAN)[1:-1, 1:-1]
-    return float(1.4826 * np.median(np.abs(left)) / 6) if left.size else 0.0
+    return robust_std(left) / 6 if left.size else 0.0
 
 
 def _slope_power(image: Image, window_px: int, noise: float) -> NDArray[np.float32]:

@@ -14,6 +14,7 @@ from numba import njit
 
 from rigwake._types import Array, Mask
 from rigwake.geometry import so3
+from rigwake.robust import MAD_TO_STD
 from rigwake.tracking.picture_scale import ScaledRays
 
 _STENCIL_PX = 2.0
@@ -54,7 +55,7 @@ def _kabsch(before: Array, after: Array) -> Array:
                 )
                 squared += (after[n, i] - seen) ** 2
             error[n] = sqrt(squared)
-        scale = max(1.4826 * np.median(error), _MIN_ANGLE)
+        scale = max(MAD_TO_STD * np.median(error), _MIN_ANGLE)
         for n in range(len(before)):
             weights[n] = 1.0 / (1.0 + (error[n] / scale) ** 2)
     return rotation

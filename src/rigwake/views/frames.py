@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rigwake._types import Image
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import InputError, UsageError
+from rigwake.geometry.interpolate import nearest_indices
 from rigwake.parallel import in_order
 from rigwake.recording import CameraStream, Frame, Recording
 from rigwake.views.surround_rig import SurroundRig
@@ -205,13 +206,10 @@ def _plan(
     stamps = stream.timestamps_ns
     if len(stamps) == 0:
         return np.zeros(len(at_ns), np.int64), np.full(len(at_ns), np.inf), 1.0
-    after = np.clip(np.searchsorted(stamps, at_ns), 1, max(len(stamps) - 1, 1))
-    after = np.minimum(after, len(stamps) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(at_ns - stamps[before] <= stamps[after] - at_ns, before, after)
+    nearest = nearest_indices(stamps, at_ns)
     period = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else np.inf
     late_s = np.asarray((stamps[nearest] - at_ns) * 1e-9, dtype=np.float64)
-    return nearest.astype(np.int64), late_s, period
+    return nearest, late_s, period
 
 
 class _Reader:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rigwake._types import Array, Indices
 from rigwake.ba.rig.gnss_noise import with_receiver_errors
-from rigwake.ba.rig.rig_values import AdjustmentOptions, AssembledProblem, InitialValues, RigMeasurements
+from rigwake.ba.rig.rig_values import AdjustmentOptions, AssembledProblem, InitialRig, RigMeasurements
 from rigwake.ba.solver.rig_problem import (
     Antenna,
     BundleCamera,
@@ -19,7 +19,7 @@ from rigwake.ba.solver.rig_problem import (
     VectorPrior,
 )
 from rigwake.errors import EstimationError
-from rigwake.geometry.interpolate import TransformSpline, interpolate
+from rigwake.geometry.interpolate import TransformSpline, interpolate, nearest_indices
 from rigwake.geometry.triangulation import triangulate_rays
 from rigwake.tracks import Tracks
 
@@ -29,7 +29,7 @@ _DEFAULT_RANGE_M = 30.0  # of points without parallax: far enough to be smooth, 
 
 
 def assemble_problem(
-    measurements: RigMeasurements, start: InitialValues, options: AdjustmentOptions
+    measurements: RigMeasurements, start: InitialRig, options: AdjustmentOptions
 ) -> AssembledProblem:
     """States at `state_rate_hz`, the best tracks of every camera, and their landmarks triangulated from the start.
 
@@ -56,7 +56,7 @@ def assemble_problem(
     return AssembledProblem(with_receiver_errors(problem), track_cameras, track_ids)
 
 
-def _antenna(measurements: RigMeasurements, start: InitialValues) -> Antenna:
+def _antenna(measurements: RigMeasurements, start: InitialRig) -> Antenna:
     """The antenna, and with an IMU the receiver's delay, which is known to be small once it was looked for."""
     if measurements.gnss is None or measurements.imu is None:
         return Antenna(start.antenna_rig, free=measurements.gnss is not None)
@@ -65,7 +65,7 @@ def _antenna(measurements: RigMeasurements, start: InitialValues) -> Antenna:
 
 
 def state_times(
-    measurements: RigMeasurements, start: InitialValues, options: AdjustmentOptions
+    measurements: RigMeasurements, start: InitialRig, options: AdjustmentOptions
 ) -> NDArray[np.int64]:
     """Stamps (rig clock) of the frames nearest to a regular grid, of the camera with the most frames inside the
     span that the rig's trajectory and the IMU cover."""
@@ -92,7 +92,7 @@ def state_times(
     return best[np.unique(nearest)]
 
 
-def _states(measurements: RigMeasurements, start: InitialValues, options: AdjustmentOptions) -> States:
+def _states(measurements: RigMeasurements, start: InitialRig, options: AdjustmentOptions) -> States:
     stamps = state_times(measurements, start, options)
     trajectory = start.world_from_rig
     world_from_rig = interpolate(trajectory.timestamps_ns, trajectory.world_from_body, stamps)
@@ -112,10 +112,7 @@ def _observe(
     offset_ns = round(camera.time_offset_s * 1e9)
     frame_stamps = tracks.timestamps_ns + offset_ns
     at = states.timestamps_ns
-    after = np.clip(np.searchsorted(frame_stamps, at), 1, max(len(frame_stamps) - 1, 1))
-    after = np.minimum(after, len(frame_stamps) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(at - frame_stamps[before] < frame_stamps[after] - at, before, after)
+    nearest = nearest_indices(frame_stamps, at)
     gap_ns = np.abs(frame_stamps[nearest] - at)
     usual_ns = np.median(np.diff(at)) if len(at) > 1 else 1e9
     frames = np.unique(nearest[gap_ns <= 0.6 * usual_ns])
@@ -182,7 +179,7 @@ def _number_landmarks(
 
 
 def observation_rays(
-    start: InitialValues, cameras: tuple[BundleCamera, ...], observations: Observations
+    start: InitialRig, cameras: tuple[BundleCamera, ...], observations: Observations
 ) -> tuple[Array, Array]:
     """Origins and unit directions (M, 3) in the world of observations, with the rig where the start has it."""
     origins, directions = np.empty((len(observations), 3)), np.empty((len(observations), 3))
@@ -201,7 +198,7 @@ def observation_rays(
 
 
 def triangulate_landmarks(
-    start: InitialValues, cameras: tuple[BundleCamera, ...], observations: Observations, count: int
+    start: InitialRig, cameras: tuple[BundleCamera, ...], observations: Observations, count: int
 ) -> Landmarks:
     """Landmarks anchored where they were first seen from; those without parallax at a default range."""
     origins, directions = observation_rays(start, cameras, observations)

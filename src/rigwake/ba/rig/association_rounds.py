@@ -16,8 +16,8 @@ from rigwake.ba.rig.outlier_rounds import adjust
 from rigwake.ba.rig.rig_values import AdjustedRig, AdjustmentOptions, AssembledProblem
 from rigwake.ba.rig.search_proposals import AssociationOptions, predicted_pixels, propose_searches
 from rigwake.ba.solver.rig_problem import Observations, RigProblem, RigSolution
-from rigwake.ba.solver.robust_loss import MAD_TO_STD
 from rigwake.recording import CameraStream
+from rigwake.robust import MAD_TO_STD
 from rigwake.tracking.masks import beyond_lens, mask_from_file
 
 _FEWEST_TO_WEIGH = 20

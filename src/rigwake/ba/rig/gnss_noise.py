@@ -16,6 +16,7 @@ from rigwake.ba.solver.linear_factors import fixes_inside
 from rigwake.ba.solver.parameter_layout import layout_of
 from rigwake.ba.solver.rig_problem import LastingErrors, RigProblem
 from rigwake.ba.solver.state_motion import nearest_states, rig_at, seconds_since_start
+from rigwake.robust import MAD_TO_STD
 
 _LEAST_STD, _MOST_STD = 0.003, 30.0  # metres, of white noise and of lasting errors
 _LEAST_TAU_S, _USUAL_TAU_S, _MOST_TAU_S = 10.0, 40.0, 300.0
@@ -66,7 +67,7 @@ def white_noise(stamps: Indices, values: Array) -> Array:
     third = np.diff(values, n=3, axis=0)[run]
     if len(third) < 8:
         return np.full(3, _LEAST_STD)
-    return np.asarray(1.4826 * np.median(np.abs(third), axis=0) / np.sqrt(20.0))
+    return np.asarray(MAD_TO_STD * np.median(np.abs(third), axis=0) / np.sqrt(20.0))
 
 
 def _antenna_off(problem: RigProblem) -> tuple[Indices, Array]:
@@ -87,7 +88,7 @@ def _lasting(stamps: Indices, off: Array, white: Array) -> Array:
     means = means[counts >= 3]
     if len(means) < 4:
         return np.zeros(3)
-    spread = 1.4826 * np.median(np.abs(means - np.median(means, axis=0)), axis=0)
+    spread = MAD_TO_STD * np.median(np.abs(means - np.median(means, axis=0)), axis=0)
     usual = float(np.median(counts[counts >= 3]))
     return np.sqrt(np.maximum(spread**2 - 2.0 * white**2 / usual, 0.0))
 

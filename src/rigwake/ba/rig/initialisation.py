@@ -7,12 +7,12 @@ all at once; gyro and accelerometer tie it to the IMU. Any trajectories will do,
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rigwake._types import Array
-from rigwake.ba.rig.rig_values import InitialValues
+from rigwake.ba.rig.rig_values import InitialRig
 from rigwake.ba.solver.rig_problem import BundleCamera, CameraParameter
 from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.cameras.protocol import CameraModel
@@ -23,23 +23,6 @@ from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.odometry.metric import metric_start
 from rigwake.recording import GnssStream, ImuStream
 from rigwake.trajectory import Trajectory
-
-
-@dataclass(frozen=True, eq=False)
-class InitialRig:
-    """Initial values, and how they came about.
-
-    start: for `assemble_problem`. handeye: the cameras on the reference camera, before any adjustment.
-    reference_camera: its name. scale_source: `gnss`, `imu`, `trajectory`, or `none` (everything is up to scale).
-    failed: cameras that could not be tied to the reference camera, with the reason. notes: in words.
-    """
-
-    start: InitialValues
-    handeye: Calibration
-    reference_camera: str
-    scale_source: str
-    failed: Mapping[str, str] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
 
 
 def initial_rig(
@@ -73,20 +56,24 @@ def initial_rig(
             )
             offset_s = lead.time_offset_s + (member.time_offset_s or 0.0)
             cameras[name] = _camera(name, models[name], rig_from_cam, offset_s, held=False)
-    start = InitialValues(
-        world_from_rig=lead.world_from_rig,
-        cameras={name: cameras[name] for name in trajectories if name in cameras},
-        gyro_bias=lead.gyro_bias,
-        accel_bias=lead.accel_bias,
-        antenna_rig=np.zeros(3) if lead.antenna_rig is None else lead.antenna_rig,
-    )
     handeye = Calibration(reference_camera, {}) if result is None else result.calibration()
     notes = lead.notes + tuple(
         f"{name}: in very many pieces; the longest were used to tie it to {reference_camera}, {left_out} poses were not"
         for name, member in handeye.cameras.items()
         if (left_out := member.statistics.get("poses_left_out", 0))
     )
-    return InitialRig(start, handeye, reference_camera, lead.scale_source, failed, notes)
+    return InitialRig(
+        world_from_rig=lead.world_from_rig,
+        cameras={name: cameras[name] for name in trajectories if name in cameras},
+        gyro_bias=lead.gyro_bias,
+        accel_bias=lead.accel_bias,
+        antenna_rig=np.zeros(3) if lead.antenna_rig is None else lead.antenna_rig,
+        handeye=handeye,
+        reference_camera=reference_camera,
+        scale_source=lead.scale_source,
+        failed=failed,
+        notes=notes,
+    )
 
 
 def _without_unobservable_offset(member: CalibratedCamera, ref_from_cam: SE3) -> SE3:

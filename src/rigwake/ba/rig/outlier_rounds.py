@@ -13,8 +13,8 @@ from rigwake.ba.rig.imu_noise import imu_noise_scales, with_imu_noise
 from rigwake.ba.rig.rig_values import AdjustedRig, AdjustmentOptions, AssembledProblem
 from rigwake.ba.solver.levenberg_marquardt import solve
 from rigwake.ba.solver.rig_problem import Observations, RigProblem, RigSolution, SolverOptions
-from rigwake.ba.solver.robust_loss import MAD_TO_STD
 from rigwake.errors import EstimationError
+from rigwake.robust import robust_std
 
 # Damping holds back just those directions that are known least, and rounds start near their optimum
 SETTLED = SolverOptions(tolerance=1e-6, shared_tolerance=0.1, initial_damping=1e-8)
@@ -80,7 +80,7 @@ def noise_scales(solution: RigSolution) -> Array:
         if own.sum() > 10:
             # each landmark takes 3 of the degrees of freedom; the median shrugs off outliers
             taken = 3 * len(np.unique(observations.landmark_indices[own])) / (2 * own.sum())
-            spread = MAD_TO_STD * float(np.median(np.abs(whitened[own])))
+            spread = robust_std(whitened[own])
             scales[index] = max(spread / np.sqrt(max(1 - taken, 0.25)), 1e-3)
     return scales
 

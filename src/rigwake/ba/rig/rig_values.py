@@ -9,6 +9,7 @@ import numpy as np
 
 from rigwake._types import Array, Indices
 from rigwake.ba.solver.rig_problem import BundleCamera, RigProblem, RigSolution, VectorPrior
+from rigwake.calibration import Calibration
 from rigwake.errors import UsageError
 from rigwake.recording import AttitudeStream, GnssStream, ImuStream
 from rigwake.tracks import Tracks
@@ -63,12 +64,15 @@ class RigMeasurements:
 
 
 @dataclass(frozen=True, eq=False)
-class InitialValues:
-    """Initial values of all unknowns.
+class InitialRig:
+    """The initial guess of all unknowns, and how it came about.
 
     world_from_rig: the rig's metric trajectory, ENU where there is GNSS, else level where there is an IMU.
     cameras: lens, first `rig_from_cam` and time offset, what is free and what is known, by name.
     gyro_bias, accel_bias: (3,) in rig axes. antenna_rig: (3,) of the GNSS antenna.
+    handeye: the cameras on the reference camera, before any adjustment; None where it was not hand-eye that gave them.
+    reference_camera: its name. scale_source: `gnss`, `imu`, `trajectory`, `baseline`, or `none` (all is up to scale).
+    failed: cameras that could not be tied to the reference camera, with the reason. notes: in words.
     """
 
     world_from_rig: Trajectory
@@ -76,6 +80,11 @@ class InitialValues:
     gyro_bias: Array = field(default_factory=lambda: np.zeros(3))
     accel_bias: Array = field(default_factory=lambda: np.zeros(3))
     antenna_rig: Array = field(default_factory=lambda: np.zeros(3))
+    handeye: Calibration | None = None
+    reference_camera: str = ""
+    scale_source: str = "none"
+    failed: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

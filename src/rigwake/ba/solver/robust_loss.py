@@ -9,7 +9,6 @@ import numpy as np
 from rigwake._types import Array
 
 Loss = Literal["none", "huber", "cauchy", "tukey"]
-MAD_TO_STD = 1.4826  # the median absolute value of Gaussian noise times this is its standard deviation
 
 
 def robust(squared: Array, loss: Loss, scale: float) -> tuple[Array, Array]:

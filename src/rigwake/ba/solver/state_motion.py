@@ -16,6 +16,7 @@ from rigwake.ba.solver.parameter_layout import ParameterLayout
 from rigwake.ba.solver.preintegration import preintegrate
 from rigwake.ba.solver.rig_problem import RigProblem
 from rigwake.geometry import so3
+from rigwake.geometry.interpolate import nearest_indices
 from rigwake.geometry.se3 import SE3
 
 _SAME_TIME_S = 1e-6  # a stamp within a microsecond of a state's is that state's
@@ -85,12 +86,7 @@ def seconds_since_start(problem: RigProblem, timestamps_ns: Indices) -> Array:
 
 def nearest_states(problem: RigProblem, times_s: Array) -> Indices:
     """(n,) index of the state nearest in time."""
-    stamps = state_times_s(problem)
-    right = np.clip(np.searchsorted(stamps, times_s), 1, max(len(stamps) - 1, 1))
-    if len(stamps) == 1:
-        return np.zeros(len(times_s), dtype=np.int64)
-    closer_left = times_s - stamps[right - 1] < stamps[right] - times_s
-    return np.asarray(right - closer_left, dtype=np.int64)
+    return nearest_indices(state_times_s(problem), times_s)
 
 
 def rig_at(
