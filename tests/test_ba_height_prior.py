@@ -74,7 +74,7 @@ def test_rounding_does_not_open_what_cancels(calm: SimulatedTracks) -> None:
 
 
 @pytest.mark.slow
-def test_a_height_that_all_cameras_fraction_is_not_open_between_them(calm: SimulatedTracks) -> None:
+def test_a_height_common_to_all_cameras_is_known_between_them(calm: SimulatedTracks) -> None:
     whole = assembled(calm)
     truth = rig_in_frame(calm.recording.true_rig, "imu")
     front, left = (truth.cameras[name].rig_from_cam for name in ("front", "left"))

@@ -128,7 +128,7 @@ class TestOutliers:
 
 
 class TestVerdicts:
-    def test_the_rig_is_found_within_its_own_doubt(
+    def test_the_rig_is_found_within_its_own_uncertainty(
         self, world: SimulatedTracks, adjusted: AdjustedRig
     ) -> None:
         covariance = covariance_of(adjusted.solution.problem)
@@ -146,7 +146,7 @@ class TestVerdicts:
             assert camera.is_observable
             assert abs(camera.time_offset_s or 0.0) < 5 * (camera.time_offset_std_s or 0.0)
 
-    def test_a_camera_as_reference_takes_its_own_doubt_along(self, adjusted: AdjustedRig) -> None:
+    def test_a_camera_as_reference_takes_its_own_uncertainty_along(self, adjusted: AdjustedRig) -> None:
         """Against a Monte Carlo over the joint covariance in the IMU's frame."""
         covariance = covariance_of(adjusted.solution.problem)
         by_imu = calibrated_cameras(adjusted.solution, covariance, IMU, {}, {})
@@ -161,7 +161,9 @@ class TestVerdicts:
         np.testing.assert_allclose(root @ found @ root.T, np.eye(6), atol=0.1)
         assert not by_left.cameras["left"].covariance.any()
 
-    def test_base_link_moves_cameras_and_antenna_and_keeps_the_doubt(self, adjusted: AdjustedRig) -> None:
+    def test_base_link_moves_cameras_and_antenna_and_keeps_the_uncertainty(
+        self, adjusted: AdjustedRig
+    ) -> None:
         covariance = covariance_of(adjusted.solution.problem)
         base_from_imu = SE3.exp(np.array([0.1, -0.2, 0.3, 1.0, 2.0, 3.0]))
         by_imu = calibrated_cameras(adjusted.solution, covariance, IMU, {}, {})
@@ -253,7 +255,7 @@ class TestClusters:
         covariance, _ = covariance_of(solution.problem, clustered=clustered).parameter("cam1", "rig_from_cam")
         return np.sqrt(np.diag(covariance))
 
-    def test_independent_errors_keep_the_promise(self) -> None:
+    def test_independent_errors_have_the_predicted_spread(self) -> None:
         solution = self.rig(0, 0.0)
         ratio = self.stds(solution, True) / self.stds(solution, False)
         assert (ratio >= 1 - 1e-9).all()

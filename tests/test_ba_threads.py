@@ -73,7 +73,7 @@ def test_an_error_on_a_thread_reaches_the_caller() -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(-2, 2), min_size=1, max_size=40), st.integers(1, 2), st.integers(1, 12))
-def test_ranges_of_frames_fraction_no_state(jitter: list[int], neighbours: int, parts: int) -> None:
+def test_ranges_of_frames_share_no_state(jitter: list[int], neighbours: int, parts: int) -> None:
     first = np.clip(np.arange(len(jitter)) // 3 + jitter, 0, None)
     states = first[:, None] + np.arange(neighbours)
     bounds = np.unique(np.linspace(0, len(states), parts + 1).astype(np.int64))

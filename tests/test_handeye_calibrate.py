@@ -117,7 +117,7 @@ def test_scale_of_every_segment():
     assert np.abs(errors(PORT, result.ref_from_members["port"])).max() < 1e-8
 
 
-def test_members_are_solved_jointly_and_fraction_the_noise_of_the_reference():
+def test_members_are_solved_jointly_and_share_the_noise_of_the_reference():
     starboard = camera(-90, 15, [0.0, -1.2, 1.4])
     rng = np.random.default_rng(5)
     poses = [wavy(TIMES) * X for X in (SE3.identity(), PORT, starboard)]
@@ -194,7 +194,7 @@ def test_too_short_is_refused():
         calibrate_handeye(*_one(pair(wavy, times=TIMES[:3])), SYNCHRONOUS)
 
 
-def test_noise_does_not_feign_roll_and_pitch():
+def test_noise_adds_no_spurious_roll_and_pitch():
     """Planar motion whose attitude noise is as large as waves would be: the vertical offset stays open."""
     for seed in range(5):
         result = calibrate_handeye(*_one(pair(planar, (jittered, 5e-3, 1e-2), seed=seed)))
@@ -210,7 +210,7 @@ def test_monocular_reference_is_refused():
         calibrate_handeye(reference, [reference])
 
 
-def test_seed_is_right_without_noise_and_says_nothing_about_doubt():
+def test_the_thesis_baseline_is_right_without_noise_and_has_no_uncertainty():
     result = calibrate_handeye(*_one(pair(wavy)), HandeyeOptions(method="thesis", time_offset=False))
     assert np.abs(errors(PORT, result.ref_from_members["port"])).max() < 1e-6
     assert np.isnan(result.members["port"].covariance).all()

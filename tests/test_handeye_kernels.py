@@ -92,7 +92,7 @@ def _spd(rng, size):
     return root @ root.T + np.eye(size)
 
 
-def test_what_noise_feigns_is_the_mean_of_squared_changes():
+def test_spurious_information_is_the_mean_of_squared_changes():
     """Against errors drawn at random: `E[(ad(e) Ad)^T W ad(e) Ad]`."""
     rng = np.random.default_rng(1)
     covariance, W = 1e-2 * _spd(rng, 6), _spd(rng, 6)

@@ -102,7 +102,7 @@ def test_learnt_noise_is_as_good_as_told_whichever_side_is_better(sides, arm_m):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sides", [(1e-5, 1e-3), (1e-3, 1e-5)])
-def test_members_together_tell_whose_errors_they_fraction(sides):
+def test_members_together_tell_whose_errors_they_share(sides):
     mountings = [camera(yaw, 15, [8.0, y, 1.4]) for yaw, y in ((90, 1.2), (-90, -1.2), (0, 0.0))]
     learnt, nees = errors(True, sides, mountings, draws=10)
     known_fraction, _ = errors(False, sides, mountings, draws=10)

@@ -42,7 +42,7 @@ def test_joint_solve_agrees_with_pairs(devices):
 
 
 @pytest.mark.slow
-def test_cameras_before_a_board_without_using_that_they_fraction_it(real_recordings):
+def test_cameras_before_a_board_without_using_that_they_share_it(real_recordings):
     learnt = BENCHMARK["check_euroc"](real_recordings, None, pnp_covariances=False)
     assert learnt.from_direct[0] <= 0.06
     assert learnt.from_direct[1] <= 1.0

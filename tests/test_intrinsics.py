@@ -94,7 +94,7 @@ def sheared(observations: BoardObservations, seed: int, std: float) -> BoardObse
     return replace(observations, views=views)
 
 
-def test_errors_that_the_corners_of_a_view_fraction_widen_the_covariance() -> None:
+def test_errors_common_to_the_corners_of_a_view_widen_the_covariance() -> None:
     truth = wide_lens("kb4")
     results = [calibrate(sheared(draw(truth, seed), seed, 3e-3), "kb4") for seed in range(4)]
     nees = np.array([normalised_error(result, truth)[1] for result in results])

@@ -30,7 +30,7 @@ PIXELS = np.stack(np.meshgrid(np.linspace(100, 540, 15), np.linspace(60, 420, 12
 
 
 @pytest.mark.parametrize("model", sorted(CAMERA_CLASSES))
-def test_priors_are_as_wide_as_promised(model: str) -> None:
+def test_priors_are_as_wide_as_assumed(model: str) -> None:
     lens = CAMERA_CLASSES[model](CAMERA_CLASSES[model].nominal_values(400.0, 320.0, 240.0), 640, 480)
     prior = intrinsics_prior(lens, PIXELS)
     covariance = np.linalg.inv(prior.information)

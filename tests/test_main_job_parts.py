@@ -18,7 +18,9 @@ from rigwake.ba.rig.gnss_noise import with_receiver_errors
 from rigwake.ba.rig.imu_noise import with_imu_noise
 from rigwake.ba.rig.outlier_rounds import drop_outliers
 from rigwake.ba.rig.split_checks import part_of, residual_statistics
-from rigwake.ba.solver.rig_problem import RigProblem, RigSolution
+from rigwake.ba.solver.covariance import RigCovariance
+from rigwake.ba.solver.levenberg_marquardt import solve
+from rigwake.ba.solver.rig_problem import RigProblem, RigSolution, SolverOptions
 from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.evaluation.rig_errors import compare_calibrations, evaluate_calibration
 from rigwake.evaluation.trajectory_errors import absolute_error, associate, kitti_error, relative_error
@@ -189,6 +191,25 @@ class TestSensorNoise:
         errors = with_receiver_errors(replace(problem, gnss=noisy)).antenna.errors
         assert errors is not None
         assert np.all((errors.std > 0.6) & (errors.std < 1.0))
+
+
+class TestLeastSquares:
+    def test_residuals_stand_in_the_order_of_the_observations(self, problem: RigProblem) -> None:
+        order = np.random.default_rng(0).permutation(len(problem.observations))
+        shuffled = replace(problem, observations=problem.observations.take(order))
+        once = SolverOptions(max_iterations=1)
+        given, mixed = solve(problem, once).residuals_px, solve(shuffled, once).residuals_px
+        np.testing.assert_allclose(mixed, given[order], atol=1e-6)
+
+    def test_a_quantity_is_unobservable_if_any_open_direction_touches_it(self) -> None:
+        layout: Any = None
+        directions = np.eye(4)
+        covariance = RigCovariance(layout, np.eye(4), np.ones(4), np.array([0.0, 0.0, 0.25, 1.0]), directions)
+        found, observable = covariance.of(np.array([[1.0, 0, 1, 0], [0, 0, 1, 0], [0, 0, 1, 1]]))
+        np.testing.assert_array_equal(observable, [False, True, True])
+        np.testing.assert_allclose(found[1:, 1:], [[4.0, 4.0], [4.0, 5.0]])
+        closed = RigCovariance(layout, np.eye(2), np.ones(2), np.array([0.25, 1.0]), np.eye(2))
+        assert closed.of(np.eye(2))[1].all()
 
 
 class TestGauge:

@@ -216,7 +216,7 @@ def test_careful_still_is_as_good_and_closes_astern(scene) -> None:
     assert step < 3 * usual
 
 
-def test_rings_bumper_and_doubt() -> None:
+def test_rings_bumper_and_uncertainty() -> None:
     assert ring_distances(25.0) == [5, 10, 15, 20, 25]
     assert all(len(ring_distances(r)) <= 6 for r in np.geomspace(1, 900, 60))
     uncertainty = WaterUncertainty(height_std_m=0.04, tilt_std=0.01)

@@ -223,10 +223,10 @@ def _worlds(reference: Sampled, member: Sampled, X: SE3, scales: Array, layout: 
     rotations, translations = [], []
     for segment in range(layout.world_count):
         here = (member.segments == segment) & (reference.segments >= 0)
-        seen = member.world_from_body
-        products = body.rotation[here] @ np.swapaxes(seen.rotation[here], -1, -2)
+        moved = member.world_from_body
+        products = body.rotation[here] @ np.swapaxes(moved.rotation[here], -1, -2)
         R = so3.nearest_rotation(products.sum(axis=0)) if here.any() else np.eye(3)
-        offset = body.translation[here] - float(scales[segment]) * seen.translation[here] @ R.T
+        offset = body.translation[here] - float(scales[segment]) * moved.translation[here] @ R.T
         rotations.append(R)
         translations.append(np.asarray(offset.mean(axis=0)) if here.any() else np.zeros(3))
     return SE3(np.stack(rotations), np.stack(translations))

@@ -57,21 +57,21 @@ def write_trajectories(folder: Path, problem: RigProblem) -> None:
 
 def _write_residuals(path: Path, adjusted: AdjustedRig) -> None:
     problem = adjusted.solution.problem
-    seen = problem.observations
-    step = max(1, -(-len(seen) // _MOST_RESIDUALS))
+    observations = problem.observations
+    step = max(1, -(-len(observations) // _MOST_RESIDUALS))
     rows = np.flatnonzero(np.isfinite(adjusted.solution.residuals_px).all(axis=1))[::step]
     angles = np.full(len(rows), np.nan)
     for index, camera in enumerate(problem.cameras):
-        own = seen.camera_indices[rows] == index
-        bearings, _ = camera.model.unproject(seen.pixels[rows][own])
+        own = observations.camera_indices[rows] == index
+        bearings, _ = camera.model.unproject(observations.pixels[rows][own])
         angles[own] = np.rad2deg(np.arccos(np.clip(bearings[:, 2], -1, 1)))
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
             file,
-            camera=seen.camera_indices[rows],
+            camera=observations.camera_indices[rows],
             camera_names=np.array([camera.name for camera in problem.cameras]),
-            timestamp_ns=seen.timestamps_ns[rows],
-            pixels=seen.pixels[rows].astype(np.float32),
+            timestamp_ns=observations.timestamps_ns[rows],
+            pixels=observations.pixels[rows].astype(np.float32),
             residuals_px=adjusted.solution.residuals_px[rows].astype(np.float32),
             angle_deg=angles.astype(np.float32),
         )
@@ -119,7 +119,7 @@ def _busiest_images(matches: CrossCameraMatches, camera: int) -> list[tuple[int,
 def _association_points(
     problem: RigProblem, matches: CrossCameraMatches, camera: int, stamp: int, rows: Any
 ) -> list[dict[str, Any]]:
-    unused, seen = matches.unused, problem.observations
+    unused, observations = matches.unused, problem.observations
     landmarks = unused.landmark_indices[rows]
     cam_from_world = camera_from_world(problem, camera, np.array([stamp]))[0]
     predicted, _ = problem.cameras[camera].model.project(
@@ -127,7 +127,7 @@ def _association_points(
     )
     points = []
     for k, landmark in enumerate(landmarks):
-        sources = seen.camera_indices[seen.landmark_indices == landmark]
+        sources = observations.camera_indices[observations.landmark_indices == landmark]
         source = problem.cameras[int(sources[0])].name if len(sources) else ""
         points.append(
             {

@@ -135,16 +135,18 @@ def propose_searches(
 
 def _best_source(problem: RigProblem) -> Indices:
     """(L,) the observation of each landmark made from nearest, where its patch is largest."""
-    seen = problem.observations
-    ranges = np.empty(len(seen))
+    observations = problem.observations
+    ranges = np.empty(len(observations))
     points = problem.landmarks.points_world
     for index in range(len(problem.cameras)):
-        rows = np.flatnonzero(seen.camera_indices == index)
+        rows = np.flatnonzero(observations.camera_indices == index)
         if len(rows):
-            cam_from_world = camera_from_world(problem, index, seen.timestamps_ns[rows])
-            ranges[rows] = np.linalg.norm(cam_from_world * points[seen.landmark_indices[rows]], axis=1)
-    order = np.lexsort((ranges, seen.landmark_indices))
-    first = np.searchsorted(seen.landmark_indices[order], np.arange(len(problem.landmarks)))
+            cam_from_world = camera_from_world(problem, index, observations.timestamps_ns[rows])
+            ranges[rows] = np.linalg.norm(
+                cam_from_world * points[observations.landmark_indices[rows]], axis=1
+            )
+    order = np.lexsort((ranges, observations.landmark_indices))
+    first = np.searchsorted(observations.landmark_indices[order], np.arange(len(problem.landmarks)))
     return np.asarray(order[first])
 
 
@@ -160,14 +162,14 @@ def _of_camera(
     image, landmarks, pixels = _visible(problem, camera, stamps, usable, source, options)
     fresh = _not_seen_lately(problem, camera, landmarks, stamps[image], options)
     chosen = fresh[_spread(landmarks[fresh], image[fresh], options.views_per_camera)]
-    landmarks, seen = landmarks[chosen], problem.observations
+    landmarks, observations = landmarks[chosen], problem.observations
     at = source[landmarks]
     return Searches(
         landmarks,
-        seen.camera_indices[at],
-        seen.timestamps_ns[at],
-        seen.pixels[at],
-        seen.std_px[at],
+        observations.camera_indices[at],
+        observations.timestamps_ns[at],
+        observations.pixels[at],
+        observations.std_px[at],
         np.full(len(chosen), camera),
         stamps[image[chosen]],
         pixels[chosen],
@@ -229,10 +231,10 @@ def _seen_alike(points: Array, sources: Array, centres: Array, options: Associat
 
 def _source_centres(problem: RigProblem, source: Indices) -> Array:
     """(L, 3) where the camera was that each landmark's patch is taken from."""
-    seen, centres = problem.observations, np.empty((len(source), 3))
+    observations, centres = problem.observations, np.empty((len(source), 3))
     for index in range(len(problem.cameras)):
-        rows = np.flatnonzero(seen.camera_indices[source] == index)
-        cam_from_world = camera_from_world(problem, index, seen.timestamps_ns[source[rows]])
+        rows = np.flatnonzero(observations.camera_indices[source] == index)
+        cam_from_world = camera_from_world(problem, index, observations.timestamps_ns[source[rows]])
         centres[rows] = cam_from_world.inverse().translation
     return centres
 
@@ -241,12 +243,12 @@ def _not_seen_lately(
     problem: RigProblem, camera: int, landmarks: Indices, stamps: Indices, options: AssociationOptions
 ) -> Indices:
     """Rows whose landmark this camera has not observed within `min_gap_s` of the stamp."""
-    seen = problem.observations
-    own = seen.camera_indices == camera
+    observations = problem.observations
+    own = observations.camera_indices == camera
     first = np.full(len(problem.landmarks), np.iinfo(np.int64).max)
     last = np.full(len(problem.landmarks), np.iinfo(np.int64).min)
-    np.minimum.at(first, seen.landmark_indices[own], seen.timestamps_ns[own])
-    np.maximum.at(last, seen.landmark_indices[own], seen.timestamps_ns[own])
+    np.minimum.at(first, observations.landmark_indices[own], observations.timestamps_ns[own])
+    np.maximum.at(last, observations.landmark_indices[own], observations.timestamps_ns[own])
     gap = int(options.min_gap_s * 1e9)
     never = last[landmarks] == np.iinfo(np.int64).min
     before = stamps < np.where(never, 0, first[landmarks]) - gap

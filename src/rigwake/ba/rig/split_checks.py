@@ -47,17 +47,17 @@ def residual_statistics(solution: RigSolution) -> dict[str, dict[str, Any]]:
 
 def part_of(problem: RigProblem, first: int, last: int, min_observations: int) -> RigProblem:
     """The problem of the states `first..last - 1` alone, with the landmarks that are seen often enough in them."""
-    states, seen = problem.states, problem.observations
+    states, observations = problem.states, problem.observations
     inside = slice(first, last)
     stamps = states.timestamps_ns[inside]
     offsets = np.array([round(c.time_offset_s * 1e9) for c in problem.cameras])
-    at = seen.timestamps_ns + offsets[seen.camera_indices]
+    at = observations.timestamps_ns + offsets[observations.camera_indices]
     margin = int(np.median(np.diff(states.timestamps_ns)) // 2)
     rows = (at >= stamps[0] - margin) & (at <= stamps[-1] + margin)
-    counts = np.bincount(seen.landmark_indices[rows], minlength=len(problem.landmarks))
+    counts = np.bincount(observations.landmark_indices[rows], minlength=len(problem.landmarks))
     kept = np.flatnonzero(counts >= min_observations)
-    rows &= counts[seen.landmark_indices] >= min_observations
-    part = seen.take(rows)
+    rows &= counts[observations.landmark_indices] >= min_observations
+    part = observations.take(rows)
     inertial = states.inertial
     if inertial is not None:
         inertial = InertialStates(*(getattr(inertial, name)[inside] for name in vars(inertial)))
@@ -134,10 +134,10 @@ def association_errors(solution: RigSolution, unused: Observations) -> dict[str,
 
 def _first_camera(problem: RigProblem) -> np.ndarray:
     """(L,) the camera that saw each landmark first."""
-    seen = problem.observations
-    order = np.lexsort((seen.timestamps_ns, seen.landmark_indices))
-    starts = np.searchsorted(seen.landmark_indices[order], np.arange(len(problem.landmarks)))
-    return np.asarray(seen.camera_indices[order[np.minimum(starts, len(order) - 1)]])
+    observations = problem.observations
+    order = np.lexsort((observations.timestamps_ns, observations.landmark_indices))
+    starts = np.searchsorted(observations.landmark_indices[order], np.arange(len(problem.landmarks)))
+    return np.asarray(observations.camera_indices[order[np.minimum(starts, len(order) - 1)]])
 
 
 def _summary(distance: np.ndarray) -> Mapping[str, Any]:

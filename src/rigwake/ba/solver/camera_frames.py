@@ -37,11 +37,11 @@ class Frames:
 
 def frames_of(problem: RigProblem) -> Frames:
     """The problem's images and the order of its observations."""
-    seen = problem.observations
-    stamps_ns, instants = np.unique(seen.timestamps_ns, return_inverse=True)
+    observations = problem.observations
+    stamps_ns, instants = np.unique(observations.timestamps_ns, return_inverse=True)
     n_cameras = max(len(problem.cameras), 1)
-    unique, inverse = np.unique(instants * n_cameras + seen.camera_indices, return_inverse=True)
-    order = np.lexsort((inverse, seen.landmark_indices))
+    unique, inverse = np.unique(instants * n_cameras + observations.camera_indices, return_inverse=True)
+    order = np.lexsort((inverse, observations.landmark_indices))
     cameras, stamps = unique % n_cameras, seconds_since_start(problem, stamps_ns)[unique // n_cameras]
     offsets = np.array([camera.time_offset_s for camera in problem.cameras])
     of_observation = inverse[order]
@@ -53,7 +53,7 @@ def frames_of(problem: RigProblem) -> Frames:
         nearest_states(problem, stamps + offsets[cameras]),
         order,
         of_observation,
-        np.searchsorted(seen.landmark_indices[order], np.arange(len(problem.landmarks) + 1)),
+        np.searchsorted(observations.landmark_indices[order], np.arange(len(problem.landmarks) + 1)),
         tuple(np.flatnonzero(cameras == c) for c in every_camera),
         tuple(np.flatnonzero(camera_of_observation == c) for c in every_camera),
     )

@@ -151,11 +151,11 @@ def _compared(
     problem: RigProblem, frames: Frames, views: list[_View], options: SolverOptions
 ) -> tuple[Reprojection, Array]:
     """Residuals and cost, and the factors (M,) that whiten and robustly weight; 0 where not valid."""
-    m, seen = len(frames.order), problem.observations
+    m, observations = len(frames.order), problem.observations
     predicted, valid = np.full((m, 2), np.nan), np.zeros(m, dtype=bool)
     for view in views:
         predicted[view.rows], valid[view.rows] = view.projection.pixels, view.projection.valid
-    residuals, weights = predicted - seen.pixels[frames.order], 1 / seen.std_px[frames.order]
+    residuals, weights = predicted - observations.pixels[frames.order], 1 / observations.std_px[frames.order]
     squared = np.where(valid, np.sum((residuals * weights[:, None]) ** 2, axis=1), 0.0)
     loss, slope = robust(squared, options.loss, options.loss_scale)
     beyond = sum(view.beyond for view in views)
