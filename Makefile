@@ -26,8 +26,9 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# every benchmark: its figures as JSON, and the pages of docs/measurements from these
 bench: $(STAMP)
-	@for file in benchmarks/*.py; do echo "== $$file"; OPENBLAS_NUM_THREADS=1 $(BIN)/python $$file || exit 1; done
+	$(BIN)/python benchmarks/record.py --all
 
 mutants: $(STAMP)
 	$(BIN)/python tests/run_mutants.py

@@ -17,6 +17,7 @@ from rigwake.cameras.formats.camera_files import write_cameras
 from rigwake.cli.main import VERBS
 from rigwake.errors import InputError, UnobservableError, UsageError
 from rigwake.geometry.se3 import SE3
+from rigwake.readers.trajectories import read_trajectory
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -90,7 +91,7 @@ def test_handeye_and_evaluate_take_values_and_paths(files, tmp_path):
     errors = rigwake.evaluate(found, tmp_path / "rig.yaml")
     assert errors.cameras["port"].rotation_error_deg < 1e-6
     with pytest.raises(UsageError, match="with a rig, not with a trajectory"):
-        rigwake.evaluate(found, api._trajectory(files["rig_tum"]))
+        rigwake.evaluate(found, read_trajectory(files["rig_tum"]).trajectory)
 
 
 def test_errors_are_those_of_the_verbs(files, tmp_path):

@@ -17,7 +17,7 @@ LAYERS = [
         "fingerprint",
         "host_faults",
         "parallel",
-        "robust",
+        "_robust",
         "workers",
         "kernel_cache",
         "text_files",

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigwake._robust import robust_std
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import EstimationError, RigwakeError
 from rigwake.geometry.se3 import stack
@@ -14,7 +15,6 @@ from rigwake.intrinsics.board_adjustment import BoardEstimate, adjust, residuals
 from rigwake.intrinsics.board_calibration import MIN_VIEWS, calibrate
 from rigwake.intrinsics.board_observations import BoardObservations
 from rigwake.intrinsics.initial_guess import stacked, view_pose
-from rigwake.robust import robust_std
 
 CANDIDATES = ("pinhole", "kb4", "eucm", "ds", "fov", "mei", "scaramuzza", "rational")
 _FOLDS = 5

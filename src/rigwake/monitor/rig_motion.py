@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from rigwake._robust import robust_std
 from rigwake._types import Array, Stamps
 from rigwake.geometry import so3
 from rigwake.odometry.gyro import integrate_gyro
 from rigwake.odometry.imu_alignment import with_noise
 from rigwake.recording import GnssStream, ImuStream
-from rigwake.robust import robust_std
 
 _GRAVITY_WINDOW_S = 60.0  # a vessel's velocity changes by a few m/s at most: 0.07 m/s^2 of the mean force
 _BIAS_WINDOW_S, _BIAS_MEAN_S = 120.0, 10.0

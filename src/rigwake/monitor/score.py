@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from rigwake._robust import MAD_TO_STD
 from rigwake._types import Array, Indices
 from rigwake.monitor.frame_pairs import EpipolarPairs, pair_frames
 from rigwake.monitor.pair_kernels import COLUMNS, MOUNTING, accumulate, pair_residuals, sum_by
 from rigwake.monitor.rig_motion import PairMotion, RigMotion
 from rigwake.monitor.velocity import Slots, VelocityPriors, slots_of, solve_velocities, without_slow
 from rigwake.rig import Rig
-from rigwake.robust import MAD_TO_STD
 from rigwake.tracks import Tracks
 
 BLOCK_S = 10.0

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rigwake._robust import robust_std
 from rigwake._types import Array, Indices
 from rigwake.ba.solver.covariance import covariance_of
 from rigwake.ba.solver.levenberg_marquardt import solve
@@ -37,7 +38,6 @@ from rigwake.odometry.imu_alignment import with_noise
 from rigwake.odometry.metric import MetricStart
 from rigwake.odometry.result import OdometryResult
 from rigwake.recording import AttitudeStream, GnssStream, ImuStream
-from rigwake.robust import robust_std
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 

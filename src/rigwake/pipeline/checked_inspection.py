@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from rigwake._progress import CountProgress
 from rigwake.inspection.readiness import Readiness, judge
 from rigwake.inspection.recording_inspection import (
     MIN_MOTION_SAMPLES,
     Inspection,
-    Progress,
     inspect_recording,
 )
 from rigwake.pipeline.sensor_checks import imu_checks
@@ -17,7 +17,7 @@ from rigwake.recording import Finding, Recording, main_imu
 
 
 def inspect_with_checks(
-    recording: Recording, progress: Progress | None = None
+    recording: Recording, progress: CountProgress | None = None
 ) -> tuple[Inspection, Readiness, tuple[SensorCheck, ...]]:
     """The inspection, whether it is enough to calibrate, and the checks; a sensor that is wrong is an error of it."""
     inspection = inspect_recording(recording, progress)

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rigwake._robust import robust_std
 from rigwake._types import Array, Indices
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import EstimationError
 from rigwake.geometry import so3
 from rigwake.geometry.interpolate import interpolate
-from rigwake.robust import robust_std
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 

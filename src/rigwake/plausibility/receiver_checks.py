@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._robust import robust_std
 from rigwake._types import Array
 from rigwake.errors import UnobservableError
 from rigwake.plausibility.receiver_fit import ReceiverFit, axis_confusions, fit_receiver, frozen_rows
 from rigwake.plausibility.values import SensorCheck
 from rigwake.recording import GnssStream
-from rigwake.robust import robust_std
 from rigwake.trajectory import Trajectory
 
 _DRIFT = 0.01  # of the path: what a camera's own path may be off

@@ -8,11 +8,11 @@ from itertools import permutations
 
 import numpy as np
 
+from rigwake._robust import robust_std
 from rigwake._types import Array
 from rigwake.geometry import so3
 from rigwake.plausibility.turn_fit import TurnFit, rotation_between
 from rigwake.plausibility.values import SensorCheck
-from rigwake.robust import robust_std
 
 _EXPLAINED = 0.15
 _SCALE = 0.01

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._robust import robust_std
 from rigwake._types import Array, Stamps
 from rigwake.errors import UnobservableError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.odometry.gyro import integrate_gyro
 from rigwake.recording import ImuStream
-from rigwake.robust import robust_std
 from rigwake.sync import estimate_time_offset
 from rigwake.trajectory import Trajectory
 

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._robust import robust_std
 from rigwake._types import Array, Image, Mask
 from rigwake.cameras.protocol import CameraModel
 from rigwake.recording import CameraStream
-from rigwake.robust import robust_std
 from rigwake.tracking.features import detect_corners
 
 MOST_OCTAVES = 2

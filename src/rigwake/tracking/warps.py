@@ -12,9 +12,9 @@ from math import sqrt
 import numpy as np
 from numba import njit
 
+from rigwake._robust import MAD_TO_STD
 from rigwake._types import Array, Mask
 from rigwake.geometry import so3
-from rigwake.robust import MAD_TO_STD
 from rigwake.tracking.picture_scale import ScaledRays
 
 _STENCIL_PX = 2.0

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._robust import MAD_TO_STD
 from rigwake._types import Mask
 from rigwake.ba.rig.association import find_landmarks
 from rigwake.ba.rig.height_prior import restore_priors, with_height_prior
@@ -17,7 +18,6 @@ from rigwake.ba.rig.rig_values import AdjustedRig, AdjustmentOptions, AssembledP
 from rigwake.ba.rig.search_proposals import AssociationOptions, predicted_pixels, propose_searches
 from rigwake.ba.solver.rig_problem import Observations, RigProblem, RigSolution
 from rigwake.recording import CameraStream
-from rigwake.robust import MAD_TO_STD
 from rigwake.tracking.masks import beyond_lens, mask_from_file
 
 _FEWEST_TO_WEIGH = 20

@@ -11,12 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from rigwake._robust import MAD_TO_STD
 from rigwake._types import Array, Indices
 from rigwake.ba.solver.linear_factors import fixes_inside
 from rigwake.ba.solver.parameter_layout import layout_of
 from rigwake.ba.solver.rig_problem import LastingErrors, RigProblem
 from rigwake.ba.solver.state_motion import nearest_states, rig_at, seconds_since_start
-from rigwake.robust import MAD_TO_STD
 
 _LEAST_STD, _MOST_STD = 0.003, 30.0  # metres, of white noise and of lasting errors
 _LEAST_TAU_S, _USUAL_TAU_S, _MOST_TAU_S = 10.0, 40.0, 300.0

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from rigwake._robust import MAD_TO_STD
 from rigwake.ba.solver.imu_factors import inertial_rows
 from rigwake.ba.solver.parameter_layout import layout_of
 from rigwake.ba.solver.rig_problem import RigProblem, RigSolution
 from rigwake.recording import ImuStream
-from rigwake.robust import MAD_TO_STD
 
 _FEWEST = 20  # intervals between states
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rigwake._robust import robust_std
 from rigwake._types import Array
 from rigwake.ba.rig.gnss_noise import with_learnt_receiver_errors
 from rigwake.ba.rig.imu_noise import imu_noise_scales, with_imu_noise
@@ -14,7 +15,6 @@ from rigwake.ba.rig.rig_values import AdjustedRig, AdjustmentOptions, AssembledP
 from rigwake.ba.solver.levenberg_marquardt import solve
 from rigwake.ba.solver.rig_problem import Observations, RigProblem, RigSolution, SolverOptions
 from rigwake.errors import EstimationError
-from rigwake.robust import robust_std
 
 # Damping holds back just those directions that are known least, and rounds start near their optimum
 SETTLED = SolverOptions(tolerance=1e-6, shared_tolerance=0.1, initial_damping=1e-8)

@@ -70,7 +70,7 @@ class InitialRig:
     world_from_rig: the rig's metric trajectory, ENU where there is GNSS, else level where there is an IMU.
     cameras: lens, first `rig_from_cam` and time offset, what is free and what is known, by name.
     gyro_bias, accel_bias: (3,) in rig axes. antenna_rig: (3,) of the GNSS antenna.
-    handeye: the cameras on the reference camera, before any adjustment; None where it was not hand-eye that gave them.
+    handeye: the cameras on the reference camera, before any adjustment.
     reference_camera: its name. scale_source: `gnss`, `imu`, `trajectory`, `baseline`, or `none` (all is up to scale).
     failed: cameras that could not be tied to the reference camera, with the reason. notes: in words.
     """
@@ -80,7 +80,7 @@ class InitialRig:
     gyro_bias: Array = field(default_factory=lambda: np.zeros(3))
     accel_bias: Array = field(default_factory=lambda: np.zeros(3))
     antenna_rig: Array = field(default_factory=lambda: np.zeros(3))
-    handeye: Calibration | None = None
+    handeye: Calibration = field(default_factory=lambda: Calibration("", {}))
     reference_camera: str = ""
     scale_source: str = "none"
     failed: Mapping[str, str] = field(default_factory=dict)
