@@ -11,7 +11,17 @@ import numpy as np
 import pytest
 
 from ba_rigs import FISHEYE, Wanted, true_problem
-from odometry_worlds import TIME_OFFSET_S, sensors_of, visual_path
+from handeye_scenes import PORT, drifting, trajectory, wavy
+from odometry_worlds import (
+    ANTENNA_RIG,
+    RIG_FROM_CAM,
+    TIME_OFFSET_S,
+    circling,
+    fisheye,
+    sensors_of,
+    tracks_of,
+    visual_path,
+)
 from rigwake.atomic import write_text_atomic
 from rigwake.ba.rig.gauge import with_gauge
 from rigwake.ba.rig.gnss_noise import with_receiver_errors
@@ -24,14 +34,26 @@ from rigwake.ba.solver.rig_problem import RigProblem, RigSolution, SolverOptions
 from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.evaluation.rig_errors import compare_calibrations, evaluate_calibration
 from rigwake.evaluation.trajectory_errors import absolute_error, associate, kitti_error, relative_error
+from rigwake.exporters.export_base import refer_to_camera
 from rigwake.geometry import so3
 from rigwake.geometry.interpolate import interpolate
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.motions import Sampled, TrajectoryCurve, steps_between
+from rigwake.handeye.handeye_problem import HandeyeOptions
+from rigwake.handeye.joint_calibration import calibrate_handeye
+from rigwake.handeye.motions import (
+    Mounting,
+    MountingLayout,
+    Sampled,
+    Steps,
+    TrajectoryCurve,
+    linearise,
+    steps_between,
+)
 from rigwake.handeye.noise import noise_over_steps
 from rigwake.odometry.gyro import align_gyro
 from rigwake.odometry.imu_alignment import align_inertial
 from rigwake.odometry.metric import metric_start
+from rigwake.odometry.thesis_odometry import estimate_thesis
 from rigwake.pipeline.outputs import horizon_of_image, horizon_pixels, write_trajectories
 from rigwake.pipeline.stage_files import StageLedger, stage_key
 from rigwake.readers.trajectories import read_trajectory
@@ -231,6 +253,24 @@ class TestMetric:
         moved = start.world_from_rig.timestamps_ns - start.world_from_cam.timestamps_ns
         np.testing.assert_array_equal(moved, round(start.time_offset_s * 1e9))
 
+    def test_the_antenna_is_placed_on_the_rig_and_not_on_the_camera(self) -> None:
+        imu, gnss = sensors_of()[:2]
+        start = metric_start(visual_path(), imu, gnss)
+        assert start.antenna_rig is not None
+        off = np.abs(start.antenna_rig - ANTENNA_RIG).max()
+        in_camera_axes = np.abs(RIG_FROM_CAM.inverse() * ANTENNA_RIG - ANTENNA_RIG).max()
+        assert off < 0.3 < 0.5 * in_camera_axes
+
+    def test_steps_of_the_thesis_baseline_have_their_relative_lengths(self) -> None:
+        path = circling(80)
+        path = path[
+            np.cumsum(np.tile([1, 1, 2, 2], 12))
+        ]  # the boat goes twice as fast every other half second
+        tracks = tracks_of(path, fisheye(), noise_px=1e-4)
+        found = estimate_thesis(tracks, fisheye())
+        truth = Trajectory("front", tracks.timestamps_ns, path)
+        assert absolute_error(truth, found, alignment="sim3").rmse_m < 0.05
+
     def test_uncertainty_does_not_depend_on_the_unit_of_the_visual_path(self) -> None:
         imu, visual = sensors_of()[0], visual_path()
         pose = visual.world_from_body
@@ -269,6 +309,36 @@ class TestHandeye:
         np.testing.assert_allclose(added[:, 0, 0], [1 + 0.25 * 2, 0.75 * 2 + 3 + 0.5 * 4], rtol=1e-5)
         between = noise_over_steps(covariances, curve, times, absolute=True)
         np.testing.assert_allclose(between[:, 0, 0], times, rtol=1e-5)
+
+    def test_agreed_motions_are_without_the_references_errors(self) -> None:
+        mount = SE3(so3.exp(np.array([0.3, -0.2, 0.5])), np.array([1.0, 0.5, -0.3]))
+        motion = SE3(so3.exp(np.array([[0.1, 0.2, -0.1]])), np.array([[2.0, 0.1, 0.3]]))
+        zero, error = np.zeros((1, 6)), np.array([[0.02, -0.01, 0.03, 0.1, 0.2, -0.1]])
+        steps = Steps(motion, motion, zero, zero, np.array([True]), np.zeros(1, np.int64))
+        guess = Mounting(mount, None, 0.0, np.zeros(1))
+        found = linearise(steps, guess, MountingLayout(0, False, 0), error)
+        agreed = mount.inverse() * motion[0] * mount * SE3.exp(-error[0])
+        np.testing.assert_allclose(found.adjoints[0], agreed.inverse().adjoint(), atol=1e-12)
+
+    def test_the_uncertainty_of_a_scale_is_relative_to_it(self) -> None:
+        """A member in another unit: its factor grows, and so does the deviation of that factor."""
+        rng, times = np.random.default_rng(2), np.arange(150) * 0.2
+        body, member = (drifting(wavy(times) * X, 1e-3, 1e-2, rng) for X in (SE3.identity(), PORT))
+        scales = []
+        for unit in (1.0, 0.1):
+            visual = SE3(member.rotation, unit * member.translation)
+            found = calibrate_handeye(
+                trajectory("rig", body, times),
+                [trajectory("cam", visual, times, is_metric=False)],
+                HandeyeOptions(noise="increments", time_offset=False),
+            ).members["cam"]
+            assert found.scale is not None
+            assert found.scale_std is not None
+            assert abs(found.scale * unit - 1) < 5 * found.scale_std * unit
+            scales.append((found.scale, found.scale_std))
+        (one, one_std), (ten, ten_std) = scales
+        assert ten == pytest.approx(10 * one, rel=1e-3)
+        assert ten_std == pytest.approx(10 * one_std, rel=0.05)
 
     def test_steps_end_where_the_member_breaks(self) -> None:
         n = 4
@@ -325,6 +395,17 @@ class TestTrajectoryErrors:
         assert found.scale == pytest.approx(0.5)
         assert found.rotation_rmse_deg == pytest.approx(3.0)
 
+    def test_one_pose_far_off_counts_by_its_square(self) -> None:
+        truth = self.path(steps=99)
+        moved = truth.world_from_body.translation.copy()
+        moved[50, 1] += 1.0
+        found = absolute_error(
+            truth,
+            replace(truth, world_from_body=SE3(truth.world_from_body.rotation, moved)),
+            alignment=None,
+        )
+        assert (found.rmse_m, found.mean_m) == (pytest.approx(0.1), pytest.approx(0.01))
+
     def test_each_pose_is_used_once_and_only_near_in_time(self) -> None:
         truth = self.path(steps=9)
         late = replace(truth, timestamps_ns=truth.timestamps_ns + np.where(np.arange(10) < 5, 4, 40) * 10**6)
@@ -359,6 +440,21 @@ class TestRigErrors:
         found = compare_calibrations(first, second)["a"]
         np.testing.assert_allclose(found.translation_mm, [10.0, 0.0, -20.0], atol=1e-9)
         assert found.time_offset_ms == pytest.approx(2.0)
+
+
+class TestExportedRigs:
+    def test_a_rig_seen_from_one_of_its_cameras(self) -> None:
+        first = SE3(so3.exp(np.array([0.9, -0.4, 1.3])), np.array([1.0, 2.0, -0.5]))
+        second = SE3(so3.exp(np.array([-0.2, 0.7, 0.1])), np.array([-3.0, 0.4, 0.2]))
+        covariance = np.eye(6) * 1e-6
+        cameras = {
+            "a": rig_camera("a", first, covariance, 0.0),
+            "b": rig_camera("b", second, covariance, 0.0),
+        }
+        found = refer_to_camera(Calibration("imu", cameras), "a").cameras
+        np.testing.assert_allclose(found["a"].rig_from_cam.matrix, np.eye(4), atol=1e-12)
+        a_from_b = np.linalg.inv(first.matrix) @ second.matrix
+        np.testing.assert_allclose(found["b"].rig_from_cam.matrix, a_from_b, atol=1e-12)
 
 
 class TestReportNumbers:
