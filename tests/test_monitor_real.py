@@ -26,7 +26,9 @@ from rigwake.readers.open import open_recording
 from rigwake.recording import Frame, FrameSource, Recording
 from rigwake.rig import Rig, RigCamera
 from rigwake.simulation.watch import calibration_of
-from rigwake.tracking.masks import pixel_grid
+from rigwake.tracking.hull_picture import HullPicture, mean_picture, spread_frames
+from rigwake.tracking.masks import lens_mask, pixel_grid
+from rigwake.tracking.self_mask import find_self_mask
 from rigwake.tracking.tracking_options import TrackingOptions
 from rigwake.tracks import Tracks
 
@@ -130,7 +132,19 @@ def test_a_camera_turned_halfway(harbour: Harbour) -> None:
         )
     )
     changed, tracks = turned(harbour, "left", turn, first)
-    result = monitor(harbour.calibration, changed, tracks=tracks)
+    stream = harbour.recording.cameras["left"]
+    picture, region = (
+        mean_picture(stream, spread_frames(np.arange(first))),
+        find_self_mask(stream, lens_mask(stream).usable),
+    )
+    assert picture is not None
+    hull = {"left": HullPicture(picture, region, "of the first half")}
+    result = monitor(harbour.calibration, changed, tracks=tracks, hull=hull)
+    rotation = result.hull["left"].rotation
+    assert result.hull["left"].moved
+    assert rotation is not None
+    assert np.rad2deg(np.linalg.norm(rotation - turn)) < 0.03
+    assert any("own hull" in note for note in result.notes)
     _check_verdict(result, turn, int(changed.cameras["left"].timestamps_ns[first]))
     page = render_page(result, changed)
     assert "before: horizon" in page

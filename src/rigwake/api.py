@@ -316,10 +316,13 @@ def monitor(
     """
     from rigwake.monitor.kept_result import keep_result
     from rigwake.monitor.run import monitor as run
+    from rigwake.tracking.hull_picture import load_hull_pictures
 
     calibrated, watched = calibration_of(calibration), opened(recording)
-    result = run(calibrated, watched, progress)
-    note = Path(calibration).name if isinstance(calibration, str | Path) else ""
+    is_file = isinstance(calibration, str | Path)
+    hull = load_hull_pictures(Path(calibration).parent / "masks", calibrated.cameras) if is_file else {}
+    result = run(calibrated, watched, progress, hull=hull)
+    note = Path(calibration).name if is_file else ""
     keep_result(
         calibrated,
         watched,

@@ -58,6 +58,7 @@ def command(
     from rigwake.monitor.run import monitor
     from rigwake.readers.open import open_recording
     from rigwake.readers.topics import TopicMap
+    from rigwake.tracking.hull_picture import load_hull_pictures
 
     calibrated = load_calibration(calibration)
     if log is not None:
@@ -65,7 +66,8 @@ def command(
             pass  # what is wrong with it is told before the work
     opened = open_recording(recording, TopicMap.from_options(topic or (), topics, camera_file or ()))
     with progress_bars() as bars:
-        result = monitor(calibrated, opened, bars)
+        hull = load_hull_pictures(calibration.parent / "masks", calibrated.cameras)
+        result = monitor(calibrated, opened, bars, hull=hull)
     if json_file is not None:
         write_json(json_file, result_to_dict(result))
     keep_result(calibrated, opened, result, out_folder, log, note=calibration.name)

@@ -10,7 +10,8 @@ import numpy as np
 
 from rigwake.calibration.yaml_file import plain
 from rigwake.logbook.store import LoggedVerdict
-from rigwake.monitor.run import CameraVerdict, MonitorResult, explanation_to_dict
+from rigwake.monitor.blame import Explanation
+from rigwake.monitor.run import CameraVerdict, MonitorResult
 from rigwake.monitor.score import BLOCK_S
 from rigwake.monitor.states import CameraState
 from rigwake.monitor.vessel_rig import AXIS_WORDS
@@ -69,9 +70,23 @@ def result_to_dict(result: MonitorResult) -> dict[str, Any]:
         }
         for alarm in result.judgement.alarms
     ]
+    hull = {
+        name: {
+            "words": cue.words,
+            "moved": cue.moved,
+            "since_ns": cue.since_ns,
+            "rotation_imu_deg": None if cue.rotation is None else np.rad2deg(cue.rotation),
+            "steps": [
+                {"start_ns": s.start_ns, "rotation_imu_deg": np.rad2deg(s.rotation), "likeness": s.likeness}
+                for s in cue.steps
+            ],
+        }
+        for name, cue in result.hull.items()
+    }
     content = {
         "exit_code": result.exit_code,
         "cameras": cameras,
+        "own_hull": hull,
         "notes": list(result.notes),
         "alarms": alarms,
         "blocks": blocks,
@@ -105,3 +120,13 @@ def logged_verdicts(result: MonitorResult, recording: Path) -> list[LoggedVerdic
         )
         for name, v in result.verdicts.items()
     ]
+
+
+def explanation_to_dict(explanation: Explanation) -> dict[str, object]:
+    """Plain values for `--json`."""
+    return {
+        "cause": explanation.cause,
+        "camera": explanation.camera or None,
+        "words": explanation.words,
+        "evidence": explanation.evidence,
+    }

@@ -99,6 +99,12 @@ def _blamed(result: MonitorResult) -> str:
             if blamed
             else "`rigwake monitor` shows why.",
         )
+    if result.verdicts[blamed[0]].alarm is None:
+        raise UnobservableError(
+            f"Only the own hull in the picture shows that {blamed[0]} moved; the motion does not.",
+            consequence="A shift of some millimetres looks like a rotation there: no new calibration was made.",
+            remedy="Record turns to both sides near structure, and run `rigwake recalibrate` on that.",
+        )
     if result.verdicts[blamed[0]].kind == "ramp":
         raise EstimationError(
             f"{blamed[0]} is still turning ({result.verdicts[blamed[0]].rate_deg_per_hour:.2f} deg per hour).",

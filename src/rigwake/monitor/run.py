@@ -13,18 +13,20 @@ from rigwake.calibration import Calibration
 from rigwake.errors import EstimationError, UnobservableError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.monitor.blame import Explanation
 from rigwake.monitor.change_detection import Change
+from rigwake.monitor.hull_edges import HullCue, hull_cues
 from rigwake.monitor.innovations import belief_of
 from rigwake.monitor.judge import Alarm, Judgement, judge_blocks
 from rigwake.monitor.rig_motion import RigMotion, rig_motion
 from rigwake.monitor.score import BLOCK_S, BlockScores, block_starts, score_blocks
 from rigwake.monitor.states import CameraState
 from rigwake.monitor.thresholds import Thresholds
+from rigwake.monitor.trim import trim_change
 from rigwake.monitor.vessel_rig import AXIS_REMEDIES, AXIS_WORDS, MonitoredRig, camera_axes, prepare_rig
 from rigwake.recording import Recording
 from rigwake.rig import Rig
 from rigwake.tracking.front_ends import track_camera
+from rigwake.tracking.hull_picture import HullPicture
 from rigwake.tracking.masks import lens_mask
 from rigwake.tracking.self_mask import find_self_mask
 from rigwake.tracking.tracking_options import TrackingOptions
@@ -74,7 +76,8 @@ class CameraVerdict:
 
 @dataclass(frozen=True, eq=False)
 class MonitorResult:
-    """verdicts: by camera. judgement: block by block. notes: in words. monitored: in the IMU's frame."""
+    """verdicts: by camera. judgement: block by block. notes: in words. monitored: in the IMU's frame. hull: what the
+    own hull says, of the cameras of which a picture of it is kept."""
 
     verdicts: Mapping[str, CameraVerdict]
     judgement: Judgement
@@ -83,6 +86,7 @@ class MonitorResult:
     tracks: Mapping[str, Tracks]
     notes: tuple[str, ...] = ()
     thresholds: Thresholds = field(default_factory=Thresholds)
+    hull: Mapping[str, HullCue] = field(default_factory=dict)
 
     @property
     def exit_code(self) -> int:
@@ -106,11 +110,14 @@ def monitor(
     tracks: Mapping[str, Tracks] | None = None,
     thresholds: Thresholds | None = None,
     tracking: TrackingOptions | None = None,
+    hull: Mapping[str, HullPicture] | None = None,
 ) -> MonitorResult:
     """Has a camera moved since it was calibrated, or while this was recorded?
 
-    tracks: by camera, where they exist already; by default the images are tracked. Raises InputError where the
-    recording is not of the calibrated vessel or lacks an IMU, UnobservableError where it is too short or one camera's.
+    tracks: by camera, where they exist already; by default the images are tracked. hull: pictures of the own boat that
+    were kept with the calibration, by camera (`load_hull_pictures`): they tell at standstill, too. Raises InputError
+    where the recording is not of the calibrated vessel or lacks an IMU, UnobservableError where it is too short or one
+    camera's.
     """
     thresholds = thresholds or Thresholds()
     monitored = prepare_rig(calibration, recording)
@@ -137,7 +144,60 @@ def monitor(
     for name, why in monitored.left_out.items():
         verdicts[name] = CameraVerdict(name, CameraState.UNOBSERVABLE, np.full(3, np.inf), why)
     notes += rig_notes(judgement, thresholds)
-    return MonitorResult(verdicts, judgement, monitored, motion, tracks, tuple(notes), thresholds)
+    cues = _hull(monitored, starts, hull or {}, thresholds)
+    verdicts, words = with_hull(verdicts, cues, monitored.rig_from_imu.rotation)
+    notes += words
+    return MonitorResult(verdicts, judgement, monitored, motion, tracks, tuple(notes), thresholds, cues)
+
+
+def _hull(
+    monitored: MonitoredRig, starts_ns: Indices, pictures: Mapping[str, HullPicture], thresholds: Thresholds
+) -> dict[str, HullCue]:
+    """The own hull over all blocks."""
+    cameras = monitored.rig.cameras
+    return hull_cues(
+        monitored.streams,
+        {name: camera.rig_from_cam for name, camera in cameras.items()},
+        {name: camera.time_offset_s for name, camera in cameras.items()},
+        (int(starts_ns[0]), int(starts_ns[-1] + round(BLOCK_S * 1e9))),
+        pictures,
+        thresholds,
+    )
+
+
+def with_hull(
+    verdicts: Mapping[str, CameraVerdict], cues: Mapping[str, HullCue], rig_from_imu_rotation: Array
+) -> tuple[dict[str, CameraVerdict], list[str]]:
+    """Verdicts with what the own hull says, and notes.
+
+    Where the motion cannot tell, or does not tell whose fault it is, a hull that is elsewhere in the picture makes the
+    camera DRIFTED. Where the motion says that the camera is where it was, something on deck moved: a note. A hull that
+    is where it was never makes a camera OK: it may have shifted with a part of the boat.
+    """
+    out, notes = dict(verdicts), []
+    for name, cue in cues.items():
+        verdict = out[name]
+        if not cue.moved or cue.rotation is None or cue.covariance is None:
+            notes.append(f"{name}: {cue.words}")
+        elif verdict.state is CameraState.OK:
+            notes.append(
+                f"{name}: {cue.words}, yet the motion says that the camera did not turn: it shifted by some "
+                "millimetres, or something on deck moved"
+            )
+        elif verdict.state is CameraState.DRIFTED:
+            notes.append(f"{name}: {cue.words}")
+        else:
+            back = rig_from_imu_rotation
+            out[name] = replace(
+                verdict,
+                state=CameraState.DRIFTED,
+                rotation=back @ cue.rotation,
+                covariance=back @ cue.covariance @ back.T,
+                since_ns=cue.since_ns,
+                kind="step",
+                words=f"{cue.words} (step)",
+            )
+    return out, notes
 
 
 def _require_length(monitored: MonitoredRig, motion: RigMotion) -> None:
@@ -319,35 +379,3 @@ def rig_notes(judgement: Judgement, thresholds: Thresholds) -> list[str]:
         cause = "the IMU turned on its mount" if imu_too else "the boat's trim or list changed"
         notes.append(f"the level changed by {degrees:.1f} deg after {block * BLOCK_S / 60:.1f} min: {cause}")
     return notes
-
-
-_TRIM_BLOCKS, _TRIM_LEAST_DEG, _TRIM_STDS = 6, 0.3, 6.0
-
-
-def trim_change(scores: BlockScores) -> tuple[int, float] | None:
-    """Block and degrees of the largest lasting change of the mean vertical on the rig; None if there is none."""
-    seen = np.flatnonzero(np.linalg.norm(scores.gravity, axis=1) > 0.5)
-    if len(seen) < 2 * _TRIM_BLOCKS:
-        return None
-    up = scores.gravity[seen]
-    best: tuple[float, int, float] | None = None
-    for at in range(_TRIM_BLOCKS, len(up) - _TRIM_BLOCKS + 1):
-        before, after = up[:at], up[at:]
-        change = after.mean(axis=0) - before.mean(axis=0)
-        spread = np.sqrt((before.var(axis=0).sum() / len(before)) + (after.var(axis=0).sum() / len(after)))
-        score = float(np.linalg.norm(change)) / max(float(spread), np.deg2rad(0.02))
-        if best is None or score > best[0]:
-            best = score, int(seen[at]), float(np.rad2deg(np.linalg.norm(change)))
-    if best is None or best[0] < _TRIM_STDS or best[2] < _TRIM_LEAST_DEG:
-        return None
-    return best[1], best[2]
-
-
-def explanation_to_dict(explanation: Explanation) -> dict[str, object]:
-    """Plain values for `--json`."""
-    return {
-        "cause": explanation.cause,
-        "camera": explanation.camera or None,
-        "words": explanation.words,
-        "evidence": explanation.evidence,
-    }

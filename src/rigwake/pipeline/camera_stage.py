@@ -20,6 +20,7 @@ from rigwake.errors import HostError, InputError, RigwakeError
 from rigwake.odometry.measure import measure_camera
 from rigwake.odometry.monocular import estimate_monocular
 from rigwake.recording import CameraStream, ImuStream
+from rigwake.tracking.hull_picture import save_hull_picture
 from rigwake.trajectory import Trajectory
 from rigwake.writers.trajectory_writer import write_tum
 
@@ -134,6 +135,8 @@ def _process(job: CameraJob, report_stage: StageProgress, *, horizon: bool = Tru
         turns=job.turns,
     )
     measured.mask.save(job.out / "masks", stream.name)
+    if measured.mask.excluded.get("hull", np.zeros(1, dtype=bool)).any():
+        save_hull_picture(stream, job.out / "masks")
     tracks = measured.tracks
     tracks.save(tracks_file(job.out, stream.name))
     counts: dict[str, Any] = {"tracking": asdict(tracks.report) if tracks.report else {}}
