@@ -33,6 +33,7 @@ from rigwake.pipeline.camera_stage import (
     stage_files,
     tracks_file,
 )
+from rigwake.pipeline.lens_mending import MendedLenses, mend_lenses, refuse_contradicted
 from rigwake.pipeline.out_folder import check_camera_names, check_out_folder, clear_results, used_by_one
 from rigwake.pipeline.outputs import write_outputs
 from rigwake.pipeline.prior import RigPrior
@@ -46,7 +47,7 @@ from rigwake.readers.topics import TopicMap
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.recording import Recording
 from rigwake.report import build_report, load_report_content
-from rigwake.tracks import load_tracks
+from rigwake.tracks import Tracks, load_tracks
 from rigwake.trajectory import Trajectory
 
 _MOVED_PX = 0.5  # worth a word
@@ -158,27 +159,55 @@ def _estimate(
     working = _working(outcomes)
     tracks = {name: load_tracks(tracks_file(out, name)) for name in working}
     own = _trajectories(working, out, prepared.external)
-    vetted = VettedSensors(selection)
-    if config.sensor_checks:
-        progress("rig", "comparing the sensors", 0.0)
-        odd = frozenset(o.name for o in outcomes if o.without_horizon)
-        vetted = vet_sensors(selection, tracks, own, without_horizon=odd, repair=config.repair)
-        selection = vetted.selection
-        own = {name: path for name, path in own.items() if name in selection.cameras}
+    vetted, mended = _compared(prepared, selection, tracks, own, outcomes, progress)
+    selection = vetted.selection
+    own = {name: path for name, path in mended.trajectories.items() if name in selection.cameras}
     prior = without_cameras(prepared.prior, prepared.selection.cameras.keys() - own.keys())
     first = initialise_rig(selection, own, config, prior)
     save_calibration(first.handeye, out / "initial_rig.yaml")
     rig = estimate_rig(
         prepared.opened,
         selection,
-        tracks,
+        mended.tracks,
         first,
         config,
         prior,
         masks=out / "masks",
+        widths=mended.moved,
         progress=lambda words, fraction: progress("rig", words, fraction),
     )
+    cameras = rig.calibration.cameras
+    refuse_contradicted(mended, {n: c.model for n, c in cameras.items() if c.model is not None})
     return _Estimated(own, first, rig, vetted)
+
+
+def _compared(
+    prepared: _Prepared,
+    selection: Selection,
+    tracks: Mapping[str, Tracks],
+    own: Mapping[str, Trajectory],
+    outcomes: list[CameraOutcome],
+    progress: Progress,
+) -> tuple[VettedSensors, MendedLenses]:
+    """Every sensor against the others; lenses that are to be refined are mended before, if they are wrong."""
+    config, external = prepared.config, prepared.external is not None
+    if not config.sensor_checks:
+        return VettedSensors(selection), MendedLenses(selection, tracks, own)
+    progress("rig", "comparing the sensors", 0.0)
+    odd = frozenset(o.name for o in outcomes if o.without_horizon)
+    odometry = None if external else replace(config.odometry, seed=config.seed)
+    mended = MendedLenses(selection, tracks, own)
+    if config.intrinsics != "fixed":
+        mended = mend_lenses(selection, tracks, own, odometry)
+    vetted = vet_sensors(
+        mended.selection,
+        mended.tracks,
+        mended.trajectories,
+        without_horizon=odd,
+        lenses=mended.fits,
+        repair=config.repair,
+    )
+    return replace(vetted, checks=(*mended.checks, *vetted.checks)), mended
 
 
 def _conclude(

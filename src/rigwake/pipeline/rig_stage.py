@@ -7,25 +7,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rigwake._progress import StageProgress
 from rigwake.ba.rig.assemble_problem import assemble_problem
 from rigwake.ba.rig.association_rounds import CrossCameraMatches, adjust_with_association
 from rigwake.ba.rig.imu_noise import imu_noise_factors
 from rigwake.ba.rig.initialisation import initial_rig
 from rigwake.ba.rig.intrinsics_refinement import (
-    FIRMLY,
-    JUDGED,
-    holding,
+    IntrinsicsWidth,
     intrinsics_statistics,
-    kept_directions,
     prior_spreads_of,
     priors_of,
     with_free_intrinsics,
-    with_intrinsics_priors_of,
 )
-from rigwake.ba.rig.outlier_rounds import SETTLED, adjust
+from rigwake.ba.rig.outlier_rounds import adjust
 from rigwake.ba.rig.rig_values import AdjustedRig, InitialRig, RigMeasurements
 from rigwake.ba.rig.rig_verdicts import ReferenceFrame, calibrated_cameras
 from rigwake.ba.rig.split_checks import (
@@ -34,10 +28,11 @@ from rigwake.ba.rig.split_checks import (
     split_half,
     split_half_summary,
 )
+from rigwake.ba.rig.uncontradicted_lenses import hold_uncontradicted, judge_lenses
 from rigwake.ba.solver.covariance import covariance_of
-from rigwake.ba.solver.levenberg_marquardt import solve
-from rigwake.ba.solver.rig_problem import RigProblem, VectorPrior
+from rigwake.ba.solver.rig_problem import RigProblem
 from rigwake.calibration import Calibration
+from rigwake.cameras.protocol import CameraModel
 from rigwake.config import CalibrateConfig
 from rigwake.errors import EstimationError, InputError, UnobservableError
 from rigwake.geometry.se3 import SE3
@@ -88,12 +83,14 @@ def estimate_rig(
     prior: RigPrior,
     *,
     masks: Path,
+    widths: Mapping[str, IntrinsicsWidth] | None = None,
     progress: StageProgress = lambda words, fraction: None,
 ) -> RigEstimate:
     """The rig from initial values and what was tracked.
 
     tracks: by camera, of all that `first` knows. prior: the one that `first` was made with. masks: folder of the
-    cameras' masks, for cross-camera association. Images are only read with `config.adjustment.cross_camera`.
+    cameras' masks, for cross-camera association. widths: how far intrinsics may be off, of cameras whose lens was found
+    to be wrong; those given are the `recording`'s. Images are only read with `config.adjustment.cross_camera`.
 
     Raises UsageError for a reference that is not there, UnobservableError when the motion
     determines nothing, EstimationError when no trustworthy answer was found.
@@ -101,14 +98,15 @@ def estimate_rig(
     measurements = RigMeasurements(
         {name: tracks[name] for name in first.cameras}, selection.imu, selection.gnss
     )
-    adjusted, matches = _adjust(measurements, first, prior, selection, config, masks, progress)
+    adjusted, matches = _adjust(measurements, first, prior, selection, config, masks, widths or {}, progress)
     progress("checking", 0.8)
     reference = replace(
         reference_frame(recording, selection, first, config.reference), is_metric=first.scale_source != "none"
     )
     checks = _noise_checks(selection, adjusted) if config.sensor_checks else ()
     refuse(checks)
-    calibration = _conclude(selection, first, adjusted, matches, reference, config)
+    given = {name: m for name in selection.cameras if (m := recording.camera(name).model) is not None}
+    calibration = _conclude(selection, given, first, adjusted, matches, reference, config)
     return RigEstimate(calibration, adjusted, matches, checks)
 
 
@@ -127,44 +125,34 @@ def _adjust(
     selection: Selection,
     config: CalibrateConfig,
     masks: Path,
+    widths: Mapping[str, IntrinsicsWidth],
     progress: StageProgress,
 ) -> tuple[AdjustedRig, CrossCameraMatches]:
     """The rig bundle adjustment: alone first, then with landmarks associated across cameras and times."""
     assembled = assemble_problem(measurements, first, config.adjustment)
-    believed = _with_intrinsics(prior.constrained(assembled.problem), selection, config)
-    assembled = replace(assembled, problem=believed)
+    problem = _with_intrinsics(prior.constrained(assembled.problem), selection, config, widths)
+    believed, assembled = priors_of(problem), replace(assembled, problem=problem)
     progress(f"adjusting {len(assembled.problem.observations)} observations", 0.0)
     adjusted = adjust(assembled, config.adjustment, final=not config.adjustment.cross_camera)
     matches = CrossCameraMatches.nothing()
     if config.adjustment.cross_camera:
         adjusted, matches = adjust_with_association(
-            adjusted,
+            hold_uncontradicted(adjusted, believed),
             selection.cameras,
             masks,
             config.adjustment,
             config.association,
             lambda words: progress(words, 0.5),
         )
-    return _with_intrinsics_kept(adjusted, priors_of(believed)), matches
+    return judge_lenses(adjusted, believed), matches
 
 
-def _with_intrinsics_kept(adjusted: AdjustedRig, believed: Mapping[str, VectorPrior]) -> AdjustedRig:
-    """The rig solved once more, with those intrinsics as believed that the motion does not tell or does not contradict.
-
-    In the covariance the former count with what was believed of them, the latter as if they had been free.
-    """
-    if not believed:
-        return adjusted
-    problem = adjusted.solution.problem
-    kept = kept_directions(problem, covariance_of(problem, clustered=True), believed)
-    every = {name: np.concatenate([k.untold, k.agreeing], axis=1) for name, k in kept.items()}
-    solution = solve(holding(problem, every, FIRMLY), SETTLED)
-    judged = holding(problem, {name: k.untold for name, k in kept.items()}, JUDGED)
-    solution = replace(solution, problem=with_intrinsics_priors_of(solution.problem, judged))
-    return replace(adjusted, solution=solution, intrinsics_priors=believed)
-
-
-def _with_intrinsics(problem: RigProblem, selection: Selection, config: CalibrateConfig) -> RigProblem:
+def _with_intrinsics(
+    problem: RigProblem,
+    selection: Selection,
+    config: CalibrateConfig,
+    widths: Mapping[str, IntrinsicsWidth],
+) -> RigProblem:
     """The problem with intrinsics free, about what is believed of them; as it is where they are to be trusted."""
     if config.intrinsics == "fixed":
         return problem
@@ -173,11 +161,12 @@ def _with_intrinsics(problem: RigProblem, selection: Selection, config: Calibrat
         for name, stream in selection.cameras.items()
         if stream.intrinsics_covariance is not None
     }
-    return with_free_intrinsics(problem, covariances)
+    return with_free_intrinsics(problem, covariances, widths)
 
 
 def _conclude(
     selection: Selection,
+    given: Mapping[str, CameraModel],
     first: InitialRig,
     adjusted: AdjustedRig,
     matches: CrossCameraMatches,
@@ -194,7 +183,6 @@ def _conclude(
     for name, numbers in statistics.items():
         numbers |= {"noise_factor": adjusted.noise_factors[name], "dropped": adjusted.dropped[name]}
     _refuse_misfits(statistics)
-    given = {name: stream.model for name, stream in selection.cameras.items() if stream.model is not None}
     for name, numbers in intrinsics_statistics(solution.problem, covariance, given, believed).items():
         statistics[name]["intrinsics"] = numbers
     topics = {name: stream.topic for name, stream in selection.cameras.items()}

@@ -14,6 +14,7 @@ from rigwake.plausibility.force_checks import ForceVerdict, check_forces, compar
 from rigwake.plausibility.force_fit import ForceFit, longest_segment
 from rigwake.plausibility.imu_samples import vet_samples, vet_turns
 from rigwake.plausibility.lens_checks import check_lenses, fit_lenses, is_off
+from rigwake.plausibility.lens_fit import LensFit
 from rigwake.plausibility.picture_checks import check_pictures
 from rigwake.plausibility.receiver_checks import vet_receiver
 from rigwake.plausibility.receiver_fit import level_path
@@ -67,16 +68,18 @@ def vet_sensors(
     trajectories: Mapping[str, Trajectory],
     *,
     without_horizon: frozenset[str] = frozenset(),
+    lenses: Mapping[str, LensFit] | None = None,
     repair: bool,
 ) -> VettedSensors:
     """Lenses, gyroscope, clocks, mounts, accelerometer and GNSS from what every camera saw by itself.
 
     tracks, trajectories: by camera. without_horizon: cameras that show nothing above the horizon that the IMU tells;
-    they never take part. Cameras that disagree are left out while others remain; so is GNSS if there is an
-    IMU. Raises InputError that names what is wrong where nothing can be left out.
+    they never take part. lenses: their fits, where they are known already. Cameras that disagree are left out while
+    others remain; so is GNSS if there is an IMU. Raises InputError that names what is wrong where nothing can be left
+    out.
     """
     models = {name: m for name in trajectories if (m := selection.cameras[name].model) is not None}
-    found = compare_sensors(selection.imu, tracks, models, trajectories, repair=repair)
+    found = compare_sensors(selection.imu, tracks, models, trajectories, lenses=lenses, repair=repair)
     checks, imu = list(found.checks), found.imu
     accused = {check.sensor for check in disagreeing(checks)}
     checks += [_without_horizon(n) for n in sorted(without_horizon) if f"camera {n}" not in accused]
@@ -111,10 +114,11 @@ def compare_sensors(
     models: Mapping[str, CameraModel],
     trajectories: Mapping[str, Trajectory],
     *,
+    lenses: Mapping[str, LensFit] | None = None,
     repair: bool,
 ) -> Comparison:
     """Lenses, gyroscope, clocks, mounts and accelerometer; raises nothing for what does not agree."""
-    lenses = fit_lenses(tracks, models, trajectories)
+    lenses = fit_lenses(tracks, models, trajectories) if lenses is None else lenses
     checks = [*check_pictures(tracks), *check_lenses(lenses, tracks, models, trajectories)]
     if imu is None:
         checks += _without_gyroscope(trajectories) if len(trajectories) > 1 else []

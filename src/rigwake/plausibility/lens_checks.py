@@ -75,6 +75,11 @@ def check_lenses(
     return tuple(checks)
 
 
+def is_turned(fit: LensFit, lens: CameraModel) -> bool:
+    """Whether the pictures were turned or mirrored, by where the tracks want the principal point."""
+    return bool(_turned_picture(fit, lens))
+
+
 def _turned_picture(fit: LensFit, lens: CameraModel) -> str:
     """What was done to the pictures, if it puts the principal point where the tracks want it."""
     centre = lens.project(np.array([[0.0, 0.0, 1.0]]))[0][0]

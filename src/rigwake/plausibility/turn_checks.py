@@ -51,6 +51,12 @@ def check_scale(
     return (check,), middle if agreed else None
 
 
+def scale_of_lenses(fits: Mapping[str, TurnFit], sound_lenses: frozenset[str]) -> dict[str, float]:
+    """By camera that `check_scale` finds wrong, its turns over the gyroscope's: so much longer its focal length is."""
+    wrong = {check.sensor for check in check_scale(fits, sound_lenses)[0] if not check.agrees}
+    return {name: fit.scale for name, fit in fits.items() if f"camera {name}" in wrong}
+
+
 def _camera_scale(name: str, fit: TurnFit) -> SensorCheck:
     words = f"it turns by {fit.scale:.4f} of what the gyroscope and the other cameras say: its lens is wrong."
     remedy = "Calibrate its lens (`rigwake intrinsics`)."

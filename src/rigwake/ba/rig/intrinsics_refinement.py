@@ -106,21 +106,17 @@ def _stds(model: CameraModel, pixels: Array, width: IntrinsicsWidth) -> Array:
 
 
 def with_free_intrinsics(
-    problem: RigProblem,
-    covariances: Mapping[str, Array],
-    width: IntrinsicsWidth = FROM_A_FILE,
-    believed: Mapping[str, CameraModel] | None = None,
+    problem: RigProblem, covariances: Mapping[str, Array], widths: Mapping[str, IntrinsicsWidth] | None = None
 ) -> RigProblem:
-    """The problem with the intrinsics of every camera free.
+    """The problem with the intrinsics of every camera free, about those that it has.
 
-    covariances: by camera, of those that a board calibrated. believed: by camera, the lens that the prior is about,
-    where that is not the one to start from.
+    covariances: by camera, of those that a board calibrated. widths: by camera, where not `FROM_A_FILE`.
     """
     cameras = []
     for index, camera in enumerate(problem.cameras):
         pixels = problem.observations.pixels[problem.observations.camera_indices == index]
-        lens = (believed or {}).get(camera.name, camera.model)
-        prior = intrinsics_prior(lens, pixels, width, covariances.get(camera.name))
+        width = (widths or {}).get(camera.name, FROM_A_FILE)
+        prior = intrinsics_prior(camera.model, pixels, width, covariances.get(camera.name))
         cameras.append(replace(camera, free=camera.free | {"intrinsics"}, intrinsics_prior=prior))
     return replace(problem, cameras=tuple(cameras))
 
@@ -130,8 +126,9 @@ class KeptDirections:
     """Directions of one camera's parameters, in deviations of their prior, that stay as believed. Directions, not
     parameters: a polynomial may be known although none of its coefficients is.
 
-    untold: (P, h) along which the motion tells next to nothing. agreeing: (P, g) along which what the motion tells
-    agrees with what was believed: moving there would only add noise.
+    untold: (P, h) along which the motion tells next to nothing. agreeing: (P, g) all others of a lens that is right as
+    far as the motion tells: moving there would only add noise. Of a lens that is contradicted along one direction
+    there is no reason to believe the others, so these are none.
     """
 
     untold: Array
@@ -153,19 +150,22 @@ def kept_directions(
                 spread = np.asarray(np.linalg.inv(prior.information))
             values, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, spread).T))
             moved = vectors.T @ np.linalg.solve(L, camera.model.params - prior.mean)
-            open_ = values > _UNTOLD**2
-            agrees = ~open_ & (
-                (moved**2 < _CONTRADICTION**2 * values) | _barely_moved(problem, camera, prior)
-            )
-            found[camera.name] = KeptDirections(vectors[:, open_], vectors[:, agrees])
+            told = values <= _UNTOLD**2
+            contradicts = told & (moved**2 > _CONTRADICTION**2 * values)
+            followed = prior.mean + L @ vectors @ np.where(contradicts, moved, 0.0)
+            right = _barely_moved(problem, camera, prior, followed)
+            found[camera.name] = KeptDirections(vectors[:, ~told], vectors[:, told & right])
     return found
 
 
-def _barely_moved(problem: RigProblem, camera: BundleCamera, prior: VectorPrior) -> bool:
-    """Whether pixels of this camera move by less than what a tracker's own bias makes of an exact lens."""
+def _barely_moved(problem: RigProblem, camera: BundleCamera, prior: VectorPrior, params: Array) -> bool:
+    """Whether these parameters move pixels of this camera by less than what a tracker's own bias makes of an exact
+    lens."""
     index = problem.cameras.index(camera)
     pixels = problem.observations.pixels[problem.observations.camera_indices == index]
-    lengths = np.linalg.norm(moved_px(camera.model.with_params(prior.mean), camera.model, pixels), axis=1)
+    lengths = np.linalg.norm(
+        moved_px(camera.model.with_params(prior.mean), camera.model.with_params(params), pixels), axis=1
+    )
     lengths = lengths[np.isfinite(lengths)]
     return bool(len(lengths)) and float(np.sqrt(np.mean(lengths**2))) < _BARELY_PX
 

@@ -1,0 +1,192 @@
+"""Lenses that contradict their own tracks or the gyroscope, with a better start, so that the rig can refine them.
+
+A focal length 3 % off bends every camera's own trajectory: from there the bundle adjustment of the rig does not find
+back. The geometry of pairs of images and the turns of the gyroscope tell by how much focal length and principal point
+are off; the lens is moved by that, and the camera's trajectory estimated again. What remains, distortion above all, is
+left to the bundle adjustment, with a prior that believes the lens less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rigwake._types import Array
+from rigwake.ba.rig.intrinsics_refinement import IntrinsicsWidth
+from rigwake.cameras.moved_lens import moved_lens
+from rigwake.cameras.protocol import CameraModel
+from rigwake.errors import RigwakeError
+from rigwake.odometry.monocular import estimate_monocular
+from rigwake.odometry.odometry_options import OdometryOptions
+from rigwake.pipeline.stream_selection import Selection
+from rigwake.plausibility.lens_checks import check_lenses, fit_lenses, is_off, is_turned
+from rigwake.plausibility.lens_fit import LensFit
+from rigwake.plausibility.turn_checks import scale_of_lenses
+from rigwake.plausibility.turn_fit import fit_turns
+from rigwake.plausibility.values import SensorCheck, refuse
+from rigwake.recording import ImuStream
+from rigwake.tracks import Tracks
+from rigwake.trajectory import Trajectory
+
+DISBELIEVED = IntrinsicsWidth(focal=0.02, centre_px=10.0, distortion=0.1, aspect=0.002)
+"""What is known of a lens that was found to be wrong, about where it was moved to."""
+
+_ROUNDS = 3
+_FARTHEST_SCALE, _FARTHEST_SHIFT = 0.1, 0.08  # a lens further off (centre: of the width) is another camera's
+_HARDLY = 0.002  # a scale nearer to one is not worth another round
+
+
+@dataclass(frozen=True, eq=False)
+class MendedLenses:
+    """What takes part, with better lenses. fits: of the lenses as they are now; None where they were not looked at.
+    moved: by camera, those that were moved. checks: what was wrong with them, and what was done."""
+
+    selection: Selection
+    tracks: Mapping[str, Tracks]
+    trajectories: Mapping[str, Trajectory]
+    fits: Mapping[str, LensFit] | None = None
+    moved: Mapping[str, IntrinsicsWidth] = field(default_factory=dict)
+    checks: tuple[SensorCheck, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Camera:
+    """One camera on the way."""
+
+    lens: CameraModel
+    tracks: Tracks
+    trajectory: Trajectory
+
+
+def mend_lenses(
+    selection: Selection,
+    tracks: Mapping[str, Tracks],
+    trajectories: Mapping[str, Trajectory],
+    odometry: OdometryOptions | None,
+) -> MendedLenses:
+    """Lenses moved to where tracks and gyroscope want them, where these contradict them by more than chance.
+
+    tracks, trajectories: by camera. odometry: how trajectories are estimated again; None to keep them, where another
+    odometry made them. Pictures that were turned, and lenses too far off to be this camera's, stay as they are.
+    """
+    cameras = {
+        name: _Camera(lens, tracks[name], trajectory)
+        for name, trajectory in trajectories.items()
+        if (lens := selection.cameras[name].model) is not None
+    }
+    given = {name: camera.lens for name, camera in cameras.items()}
+    fits: dict[str, LensFit] = {}
+    for name, camera in cameras.items():
+        cameras[name], fit = _by_own_tracks(name, camera, odometry)
+        if fit is not None:
+            fits[name] = fit
+    for name, scale in _by_gyroscope(selection.imu, cameras, fits).items():
+        moved = _moved(cameras[name], scale, np.zeros(2), odometry)
+        if moved is not None:
+            cameras[name] = moved
+            fits |= _fit(name, moved)
+    widths = {name: DISBELIEVED for name, camera in cameras.items() if camera.lens is not given[name]}
+    streams = {
+        name: replace(stream, model=cameras[name].lens, intrinsics_covariance=None)
+        if name in widths
+        else stream
+        for name, stream in selection.cameras.items()
+    }
+    return MendedLenses(
+        replace(selection, cameras=streams),
+        {name: cameras[name].tracks if name in cameras else own for name, own in tracks.items()},
+        {name: cameras[name].trajectory if name in cameras else own for name, own in trajectories.items()},
+        fits,
+        widths,
+        tuple(_check(name, given[name], cameras[name].lens) for name in widths),
+    )
+
+
+def refuse_contradicted(mended: MendedLenses, lenses: Mapping[str, CameraModel]) -> None:
+    """Raise InputError where tracks contradict a lens that was moved even now that the rig has refined it.
+
+    lenses: refined, by camera.
+    """
+    names = [name for name in mended.moved if name in lenses]
+    models = {name: lenses[name] for name in names}
+    paths = {name: mended.trajectories[name] for name in names}
+    fits = fit_lenses(mended.tracks, models, paths)
+    refuse(check_lenses(fits, mended.tracks, models, paths), "Refining it with the rig did not mend it.")
+
+
+def _by_own_tracks(
+    name: str, camera: _Camera, odometry: OdometryOptions | None
+) -> tuple[_Camera, LensFit | None]:
+    """The camera with its lens where pairs of its images want it, and the last fit; as it was where that fails."""
+    first, fit = camera, _fit(name, camera).get(name)
+    last = fit
+    for _ in range(_ROUNDS):
+        if last is None or not is_off(last, camera.lens.width_px) or is_turned(last, camera.lens):
+            break
+        moved = _moved(camera, last.scale, last.shift_px, odometry)
+        if moved is None or _is_far(first.lens, moved.lens):
+            return first, fit
+        camera, last = moved, _fit(name, moved).get(name)
+    return camera, last
+
+
+def _fit(name: str, camera: _Camera) -> dict[str, LensFit]:
+    return fit_lenses({name: camera.tracks}, {name: camera.lens}, {name: camera.trajectory})
+
+
+def _by_gyroscope(
+    imu: ImuStream | None, cameras: Mapping[str, _Camera], fits: Mapping[str, LensFit]
+) -> dict[str, float]:
+    """Focal scales of cameras that turn by more or less than the gyroscope and the other cameras say."""
+    if imu is None:
+        return {}
+    turns = {}
+    for name, camera in cameras.items():
+        try:
+            turns[name] = fit_turns(camera.trajectory, imu)
+        except RigwakeError:
+            continue
+    sound = frozenset(name for name, fit in fits.items() if not is_off(fit, cameras[name].lens.width_px))
+    wanted = scale_of_lenses(turns, sound)
+    return {name: s for name, s in wanted.items() if _HARDLY < abs(s - 1) < _FARTHEST_SCALE}
+
+
+def _moved(
+    camera: _Camera, scale: float, shift_px: Array, odometry: OdometryOptions | None
+) -> _Camera | None:
+    """The camera with a moved lens, bearings and trajectory by it; None where that cannot be."""
+    try:
+        lens = moved_lens(camera.lens, scale, shift_px)
+        bearings, seen = lens.unproject(camera.tracks.pixels)
+        tracks = replace(camera.tracks, bearings_cam=bearings).take(np.flatnonzero(seen))
+        if odometry is None:
+            return _Camera(lens, tracks, camera.trajectory)
+        return _Camera(lens, tracks, estimate_monocular(tracks, lens, odometry).trajectory)
+    except RigwakeError:
+        return None
+
+
+def _is_far(given: CameraModel, lens: CameraModel) -> bool:
+    scale, shift = _difference(given, lens)
+    return abs(scale - 1) > _FARTHEST_SCALE or float(np.abs(shift).max()) > _FARTHEST_SHIFT * given.width_px
+
+
+def _difference(given: CameraModel, lens: CameraModel) -> tuple[float, Array]:
+    """Focal scale and shift of the centre between two lenses."""
+    axis = np.array([[0.0, 0.0, 1.0], [1e-3, 0.0, 1.0]])
+    before, after = given.project(axis)[0], lens.project(axis)[0]
+    sizes = np.linalg.norm(after[1] - after[0]), np.linalg.norm(before[1] - before[0])
+    return float(sizes[0] / sizes[1]), after[0] - before[0]
+
+
+def _check(name: str, given: CameraModel, lens: CameraModel) -> SensorCheck:
+    scale, shift = _difference(given, lens)
+    words = (
+        f"the intrinsics given do not fit what it saw. They were moved to a focal length {scale:.4f} times the one "
+        f"given and a principal point {shift[0]:+.1f}, {shift[1]:+.1f} px away, and refined from there with the rig."
+    )
+    remedy = "Calibrate its lens (`rigwake intrinsics`); --intrinsics fixed refuses such a lens."
+    quantity = "focal length by what it saw over that given"
+    return SensorCheck(f"camera {name}", False, scale, 1.0, words, remedy, quantity, "repaired")
