@@ -6,6 +6,7 @@ one more
 `FuzzInput` in a list of `INPUTS`.
 """
 
+import gzip
 import json
 import resource
 import shutil
@@ -21,6 +22,9 @@ import av
 import cv2
 import numpy as np
 import yaml
+import zstandard
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import CompressionMode
 
 from rigwake.calibration import CalibratedCamera, Calibration, load_calibration, save_calibration
 from rigwake.cameras.formats.camera_files import WRITERS, read_cameras, write_cameras
@@ -39,6 +43,7 @@ from rigwake.simulation.scenario import parse_scenario
 from rigwake.text_files import read_text_file
 from rigwake.trajectory import Trajectory
 from rigwake.writers.trajectory_writer import write_tum
+from ros_bags import SmallBag
 
 MEMORY_BYTES = 2**30
 SECONDS = 20.0
@@ -370,7 +375,56 @@ CALIBRATIONS = [
     FuzzInput("scenario", _text("scenario.yaml", "base: demo\n"), _scenario),
 ]
 
-BAGS: list[FuzzInput] = []
+
+# ---- bags
+
+
+def _fill(bag: SmallBag) -> None:
+    """Two cameras with lenses, raw and compressed, an IMU, fixes, poses and transforms."""
+    encoded = cv2.imencode(".jpg", _image(0))[1].tobytes()
+    for k in range(6):
+        bag.image("/front/image_raw", k / 10, (_image(k).astype(np.uint16) << 4), "mono16", size=(32, 24))
+        bag.compressed("/port/image_raw/compressed", k / 10, encoded)
+        bag.fix("/fix", k / 10, (53.54 + 1e-5 * k, 9.98, 40.0))
+    bag.info("/front/camera_info", size=(32, 24), matrix=[30, 0, 15.5, 0, 30, 11.5, 0, 0, 1])
+    bag.info("/port/camera_info", size=(32, 24), matrix=[30, 0, 15.5, 0, 30, 11.5, 0, 0, 1])
+    for k in range(30):
+        bag.imu("/imu/data", k / 50)
+    bag.transform("/tf_static", ("base_link", "imu"), (1, 2, 3))
+    bag.transform("/tf", ("odom", "base_link"), (1, 2, 3), 0.1)
+
+
+def _bag(name: str, ros: int, packing: str = "", **options: object) -> Callable[[Path], Path]:
+    """packing: of the file as a whole (`.gz`, `.zstd`)."""
+
+    def make(folder: Path) -> Path:
+        path = folder / name
+        with SmallBag(path, ros, **options) as bag:  # type: ignore[arg-type]
+            _fill(bag)
+        if packing == ".gz":
+            (folder / f"{name}.gz").write_bytes(gzip.compress(path.read_bytes()))
+            path.unlink()
+            return folder / f"{name}.gz"
+        if packing == ".zstd":
+            (file,) = [f for f in path.iterdir() if f.suffix != ".yaml"]
+            file.with_name(file.name + packing).write_bytes(zstandard.compress(file.read_bytes()))
+            file.unlink()
+        return path
+
+    return make
+
+
+BAGS = [
+    FuzzInput("ros1", _bag("a.bag", 1), drain),
+    FuzzInput("ros1 bz2", _bag("a.bag", 1, compression=Rosbag1Writer.CompressionFormat.BZ2), drain),
+    FuzzInput("ros1 lz4", _bag("a.bag", 1, compression=Rosbag1Writer.CompressionFormat.LZ4), drain),
+    FuzzInput("ros1 gz", _bag("a.bag", 1, packing=".gz"), drain),
+    FuzzInput("ros2 sqlite3", _bag("a", 2), drain),
+    FuzzInput("ros2 sqlite3 zstd", _bag("a", 2, packing=".zstd"), drain),
+    FuzzInput("ros2 messages zstd", _bag("a", 2, mode=CompressionMode.MESSAGE), drain),
+    FuzzInput("mcap", _bag("a", 2, storage="mcap"), drain),
+    FuzzInput("mcap zstd", _bag("a", 2, packing=".zstd", storage="mcap"), drain),
+]
 
 INPUTS = [*TRAJECTORIES, *RECORDINGS, *CALIBRATIONS, *BAGS]
 

@@ -115,6 +115,30 @@ def test_folders(cases: Path, path: str, span_s: float) -> None:
         assert camera.model is not None
 
 
+@pytest.mark.parametrize(
+    ("name", "count", "last_en"), [("altnan", 50, (32.485, 54.535)), ("zero", 45, None)]
+)
+def test_fixes_without_height_or_position(
+    cases: Path, name: str, count: int, last_en: tuple[float, float] | None
+) -> None:
+    """Without a height the plane may lie anywhere between 0 and 40 m: 0.2 mm east, which rounds to 32.48 or 32.49."""
+    gnss = open_recording(case(cases, 26) / f"{name}.bag").gnss["gnss"]
+    assert len(gnss.timestamps_ns) == count
+    if last_en is None:
+        np.testing.assert_allclose(gnss.origin_lla, (53.54005, 9.98005, 40.0))
+    else:
+        np.testing.assert_allclose(gnss.position_enu[-1, :2], last_en, atol=1e-3)
+        assert (gnss.covariances[:, 2, 2] > 1e5).all()
+
+
+@pytest.mark.parametrize("name", ["gnss", "imu_cam"])
+def test_a_clock_that_was_set(cases: Path, name: str) -> None:
+    recording = open_recording(case(cases, 40) / f"{name}.bag")
+    assert any("stamps jump by 1.7e+09 s" in f.message for f in recording.findings)
+    for stream in [*recording.cameras.values(), *recording.imus.values(), *recording.gnss.values()]:
+        assert np.ptp(stream.timestamps_ns) * 1e-9 == pytest.approx(27, abs=0.3)
+
+
 def test_units_of_a_header(cases: Path) -> None:
     (imu,) = open_recording(case(cases, 25) / "rec").imus.values()
     np.testing.assert_allclose(imu.gyro[:, 2], np.radians(0.1))

@@ -13,7 +13,7 @@ from rigwake.inspection.recording_inspection import (
 )
 from rigwake.pipeline.sensor_checks import imu_checks
 from rigwake.plausibility.values import SensorCheck
-from rigwake.recording import Finding, Recording
+from rigwake.recording import Finding, Recording, main_imu
 
 
 def inspect_with_checks(
@@ -29,8 +29,8 @@ def inspect_with_checks(
 
 
 def _sensor_checks(recording: Recording) -> tuple[SensorCheck, ...]:
-    """The first IMU that has enough samples: its units and axes, alone and against the cameras' coarse turns."""
-    imu = next((i for i in recording.imus.values() if len(i.gyro) >= MIN_MOTION_SAMPLES), None)
-    if imu is None:
+    """The IMU that every verb uses: its units and axes, alone and against the cameras' coarse turns."""
+    imu = main_imu(recording)
+    if imu is None or len(imu.gyro) < MIN_MOTION_SAMPLES:
         return ()
     return imu_checks(imu, {n: c for n, c in recording.cameras.items() if c.model is not None})
