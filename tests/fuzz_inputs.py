@@ -6,7 +6,6 @@ one more
 `FuzzInput` in a list of `INPUTS`.
 """
 
-import gzip
 import json
 import resource
 import shutil
@@ -15,17 +14,14 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import av
 import cv2
 import numpy as np
 import yaml
-import zstandard
-from rosbags.rosbag1 import Writer as Rosbag1Writer
-from rosbags.rosbag2 import CompressionMode
 
+from fuzz_files import BAGS, READ_BACK, FuzzInput, drain, small_picture
 from rigwake.calibration import CalibratedCamera, Calibration, load_calibration, save_calibration
 from rigwake.cameras.formats.camera_files import WRITERS, read_cameras, write_cameras
 from rigwake.cameras.model_fitting import convert_camera
@@ -36,37 +32,16 @@ from rigwake.exporters import FORMATS, ExportedImuNoise, ExportOptions, export_c
 from rigwake.exporters.known_rigs import read_known_rig
 from rigwake.geometry.se3 import SE3
 from rigwake.pipeline.prior import load_prior
-from rigwake.readers.open import open_recording
 from rigwake.readers.topics import TopicMap
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.simulation.scenario import parse_scenario
 from rigwake.text_files import read_text_file
 from rigwake.trajectory import Trajectory
 from rigwake.writers.trajectory_writer import write_tum
-from ros_bags import SmallBag
 
 MEMORY_BYTES = 2**30
 SECONDS = 20.0
 START_NS = 1_700_000_000_000_000_000
-
-
-@dataclass(frozen=True)
-class FuzzInput:
-    """make: writes a valid input into a folder and returns what is read. read: reads it all."""
-
-    name: str
-    make: Callable[[Path], Path]
-    read: Callable[[Path], object]
-
-
-# ---- reading
-
-
-def drain(path: Path) -> None:
-    recording = open_recording(path)
-    for camera in recording.cameras.values():
-        for _ in camera.frames(colour=True):
-            pass
 
 
 # ---- valid inputs
@@ -143,15 +118,11 @@ def nmea_text(count: int = 12) -> str:
     return "".join(lines)
 
 
-def _image(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 255, (24, 32), dtype=np.uint8)
-
-
 def _images(suffix: str, names: Callable[[int], str]) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         (folder / "rec" / "front").mkdir(parents=True)
         for k in range(4):
-            cv2.imwrite(str(folder / "rec" / "front" / f"{names(k)}{suffix}"), _image(k))
+            cv2.imwrite(str(folder / "rec" / "front" / f"{names(k)}{suffix}"), small_picture(k))
         return folder / "rec"
 
     return make
@@ -215,7 +186,7 @@ def _euroc(folder: Path) -> Path:
     rows = []
     for k in range(3):
         stamp = START_NS + 50_000_000 * k
-        cv2.imwrite(str(cam / "data" / f"{stamp}.png"), _image(k))
+        cv2.imwrite(str(cam / "data" / f"{stamp}.png"), small_picture(k))
         rows.append(f"{stamp},{stamp}.png\n")
     (cam / "data.csv").write_text("#timestamp [ns],filename\n" + "".join(rows))
     matrix = [float(x) for x in np.eye(4).ravel()]
@@ -244,7 +215,7 @@ def _kitti_raw(folder: Path) -> Path:
     for part in ("image_00", "oxts"):
         (rec / part / "timestamps.txt").write_text(lines)
     for k in range(3):
-        cv2.imwrite(str(rec / "image_00" / "data" / f"{k:010d}.png"), _image(k))
+        cv2.imwrite(str(rec / "image_00" / "data" / f"{k:010d}.png"), small_picture(k))
         values = [49.0 + 1e-5 * k, 8.4, 112.0, 0.01, 0.0, 1.0, *[0.1] * 24]
         (rec / "oxts" / "data" / f"{k:010d}.txt").write_text(" ".join(map(str, values)) + "\n")
     return rec
@@ -376,57 +347,7 @@ CALIBRATIONS = [
 ]
 
 
-# ---- bags
-
-
-def _fill(bag: SmallBag) -> None:
-    """Two cameras with lenses, raw and compressed, an IMU, fixes, poses and transforms."""
-    encoded = cv2.imencode(".jpg", _image(0))[1].tobytes()
-    for k in range(6):
-        bag.image("/front/image_raw", k / 10, (_image(k).astype(np.uint16) << 4), "mono16", size=(32, 24))
-        bag.compressed("/port/image_raw/compressed", k / 10, encoded)
-        bag.fix("/fix", k / 10, (53.54 + 1e-5 * k, 9.98, 40.0))
-    bag.info("/front/camera_info", size=(32, 24), matrix=[30, 0, 15.5, 0, 30, 11.5, 0, 0, 1])
-    bag.info("/port/camera_info", size=(32, 24), matrix=[30, 0, 15.5, 0, 30, 11.5, 0, 0, 1])
-    for k in range(30):
-        bag.imu("/imu/data", k / 50)
-    bag.transform("/tf_static", ("base_link", "imu"), (1, 2, 3))
-    bag.transform("/tf", ("odom", "base_link"), (1, 2, 3), 0.1)
-
-
-def _bag(name: str, ros: int, packing: str = "", **options: object) -> Callable[[Path], Path]:
-    """packing: of the file as a whole (`.gz`, `.zstd`)."""
-
-    def make(folder: Path) -> Path:
-        path = folder / name
-        with SmallBag(path, ros, **options) as bag:  # type: ignore[arg-type]
-            _fill(bag)
-        if packing == ".gz":
-            (folder / f"{name}.gz").write_bytes(gzip.compress(path.read_bytes()))
-            path.unlink()
-            return folder / f"{name}.gz"
-        if packing == ".zstd":
-            (file,) = [f for f in path.iterdir() if f.suffix != ".yaml"]
-            file.with_name(file.name + packing).write_bytes(zstandard.compress(file.read_bytes()))
-            file.unlink()
-        return path
-
-    return make
-
-
-BAGS = [
-    FuzzInput("ros1", _bag("a.bag", 1), drain),
-    FuzzInput("ros1 bz2", _bag("a.bag", 1, compression=Rosbag1Writer.CompressionFormat.BZ2), drain),
-    FuzzInput("ros1 lz4", _bag("a.bag", 1, compression=Rosbag1Writer.CompressionFormat.LZ4), drain),
-    FuzzInput("ros1 gz", _bag("a.bag", 1, packing=".gz"), drain),
-    FuzzInput("ros2 sqlite3", _bag("a", 2), drain),
-    FuzzInput("ros2 sqlite3 zstd", _bag("a", 2, packing=".zstd"), drain),
-    FuzzInput("ros2 messages zstd", _bag("a", 2, mode=CompressionMode.MESSAGE), drain),
-    FuzzInput("mcap", _bag("a", 2, storage="mcap"), drain),
-    FuzzInput("mcap zstd", _bag("a", 2, packing=".zstd", storage="mcap"), drain),
-]
-
-INPUTS = [*TRAJECTORIES, *RECORDINGS, *CALIBRATIONS, *BAGS]
+INPUTS = [*TRAJECTORIES, *RECORDINGS, *CALIBRATIONS, *BAGS, *READ_BACK]
 
 
 # ---- damage

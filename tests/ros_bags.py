@@ -157,9 +157,7 @@ class SmallBag:
         )
         self.write(topic, kind, message, at_s, **options)
 
-    def fix(
-        self, topic: str, at_s: float, lla: Sequence[float], status: int = 0, **options: Any
-    ) -> None:
+    def fix(self, topic: str, at_s: float, lla: Sequence[float], status: int = 0, **options: Any) -> None:
         kind = "sensor_msgs/msg/NavSatFix"
         state = self.make("sensor_msgs/msg/NavSatStatus", status, 1)
         covariance = np.diag([1.0, 1, 4]).ravel()

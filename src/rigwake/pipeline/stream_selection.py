@@ -75,7 +75,9 @@ def select(recording: Recording, config: CalibrateConfig) -> Selection:
             remedy="Record one to two minutes with turns to both sides.",
         )
     notes = [
-        f"{f.sensor + ': ' if f.sensor else ''}{f.message}" for f in recording.findings if f.severity != "note"
+        f"{f.sensor + ': ' if f.sensor else ''}{f.message}"
+        for f in recording.findings
+        if f.severity != "note"
     ]
     imu = _one("IMU", main_imu(recording), recording.imus, config.imu, notes)
     gnss = _one("GNSS receiver", main_gnss(recording), recording.gnss, config.gnss, notes)

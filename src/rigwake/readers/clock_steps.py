@@ -52,7 +52,9 @@ def _are_woven(before: Stamps, after: Stamps) -> bool:
     ordered = np.sort(before)
     usual = float(np.median(np.diff(ordered))) if len(ordered) > 1 else 0.0
     place = np.searchsorted(ordered, after)
-    inside = (place > 0) & (place < len(ordered)) & ~np.isin(after, ordered)  # what was recorded twice is the same
+    inside = (
+        (place > 0) & (place < len(ordered)) & ~np.isin(after, ordered)
+    )  # what was recorded twice is the same
     low, high = ordered[np.maximum(place - 1, 0)], ordered[np.minimum(place, len(ordered) - 1)]
     return int((inside & (high - low < _GAP_PERIODS * usual)).sum()) >= _MIN_SHARED
 
@@ -98,7 +100,9 @@ def on_one_clock(recording: Recording) -> Recording:
     part = window(replace(recording, **others), first, last)
     whole = {k: {n: s for n, s in v.items() if n in agreeing} | getattr(part, k) for k, v in named.items()}
     ordered = {k: {n: whole[k][n] for n in named[k] if n in whole[k]} for k in _STREAMS}
-    words = "left out: its clock was set back too, and its longest stretch is another than that of the others."
+    words = (
+        "left out: its clock was set back too, and its longest stretch is another than that of the others."
+    )
     lost = tuple(Finding("error", name, words) for name in sorted(opposed))
     return replace(part, **ordered, findings=(*part.findings, *lost))
 
