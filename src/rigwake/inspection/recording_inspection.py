@@ -142,7 +142,7 @@ def _unreadable_findings(recording: Recording) -> list[Finding]:
     for name, camera in recording.cameras.items():
         lost, checked = unreadable_frames(camera, most)
         if lost:
-            message = f"{lost} of {checked} encoded frames are cut off, damaged or of another size: left out of everything."
+            message = f"{lost} of {checked} encoded frames are cut off, damaged or of another size: left out."
             findings.append(
                 Finding("error" if lost > 0.5 * checked else "warning", f"camera.{name}", message)
             )
