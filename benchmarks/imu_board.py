@@ -91,7 +91,7 @@ def calibrate_boards(recordings: Path) -> AdjustedRig:
     }
     imu = read_imu(recordings)
     first = initial_rig(trajectories, {camera: lens(camera) for camera in tracks}, imu, None)
-    return adjust(assemble_problem(RigMeasurements(tracks, imu), first.start, OPTIONS), OPTIONS)
+    return adjust(assemble_problem(RigMeasurements(tracks, imu), first, OPTIONS), OPTIONS)
 
 
 def main() -> None:

@@ -14,7 +14,6 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import av
@@ -22,6 +21,7 @@ import cv2
 import numpy as np
 import yaml
 
+from fuzz_files import BAGS, READ_BACK, FuzzInput, drain, small_picture
 from rigwake.calibration import CalibratedCamera, Calibration, load_calibration, save_calibration
 from rigwake.cameras.formats.camera_files import WRITERS, read_cameras, write_cameras
 from rigwake.cameras.model_fitting import convert_camera
@@ -32,7 +32,6 @@ from rigwake.exporters import FORMATS, ExportedImuNoise, ExportOptions, export_c
 from rigwake.exporters.known_rigs import read_known_rig
 from rigwake.geometry.se3 import SE3
 from rigwake.pipeline.prior import load_prior
-from rigwake.readers.open import open_recording
 from rigwake.readers.topics import TopicMap
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.simulation.scenario import parse_scenario
@@ -43,25 +42,6 @@ from rigwake.writers.trajectory_writer import write_tum
 MEMORY_BYTES = 2**30
 SECONDS = 20.0
 START_NS = 1_700_000_000_000_000_000
-
-
-@dataclass(frozen=True)
-class FuzzInput:
-    """make: writes a valid input into a folder and returns what is read. read: reads it all."""
-
-    name: str
-    make: Callable[[Path], Path]
-    read: Callable[[Path], object]
-
-
-# ---- reading
-
-
-def drain(path: Path) -> None:
-    recording = open_recording(path)
-    for camera in recording.cameras.values():
-        for _ in camera.frames(colour=True):
-            pass
 
 
 # ---- valid inputs
@@ -138,15 +118,11 @@ def nmea_text(count: int = 12) -> str:
     return "".join(lines)
 
 
-def _image(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 255, (24, 32), dtype=np.uint8)
-
-
 def _images(suffix: str, names: Callable[[int], str]) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         (folder / "rec" / "front").mkdir(parents=True)
         for k in range(4):
-            cv2.imwrite(str(folder / "rec" / "front" / f"{names(k)}{suffix}"), _image(k))
+            cv2.imwrite(str(folder / "rec" / "front" / f"{names(k)}{suffix}"), small_picture(k))
         return folder / "rec"
 
     return make
@@ -210,7 +186,7 @@ def _euroc(folder: Path) -> Path:
     rows = []
     for k in range(3):
         stamp = START_NS + 50_000_000 * k
-        cv2.imwrite(str(cam / "data" / f"{stamp}.png"), _image(k))
+        cv2.imwrite(str(cam / "data" / f"{stamp}.png"), small_picture(k))
         rows.append(f"{stamp},{stamp}.png\n")
     (cam / "data.csv").write_text("#timestamp [ns],filename\n" + "".join(rows))
     matrix = [float(x) for x in np.eye(4).ravel()]
@@ -239,7 +215,7 @@ def _kitti_raw(folder: Path) -> Path:
     for part in ("image_00", "oxts"):
         (rec / part / "timestamps.txt").write_text(lines)
     for k in range(3):
-        cv2.imwrite(str(rec / "image_00" / "data" / f"{k:010d}.png"), _image(k))
+        cv2.imwrite(str(rec / "image_00" / "data" / f"{k:010d}.png"), small_picture(k))
         values = [49.0 + 1e-5 * k, 8.4, 112.0, 0.01, 0.0, 1.0, *[0.1] * 24]
         (rec / "oxts" / "data" / f"{k:010d}.txt").write_text(" ".join(map(str, values)) + "\n")
     return rec
@@ -370,9 +346,8 @@ CALIBRATIONS = [
     FuzzInput("scenario", _text("scenario.yaml", "base: demo\n"), _scenario),
 ]
 
-BAGS: list[FuzzInput] = []
 
-INPUTS = [*TRAJECTORIES, *RECORDINGS, *CALIBRATIONS, *BAGS]
+INPUTS = [*TRAJECTORIES, *RECORDINGS, *CALIBRATIONS, *BAGS, *READ_BACK]
 
 
 # ---- damage

@@ -138,6 +138,7 @@ class SmallBag:
         accel: Sequence[float] = (0.0, 0.1, 9.8),
         frame: str = "imu",
         absent: tuple[bool, bool] = (False, False),
+        **options: Any,
     ) -> None:
         unknown = np.array([-1.0, *[0.0] * 8])
         covariances = [unknown if missing else np.zeros(9) for missing in absent]
@@ -154,14 +155,14 @@ class SmallBag:
             vectors[1],
             covariances[1],
         )
-        self.write(topic, kind, message, at_s)
+        self.write(topic, kind, message, at_s, **options)
 
-    def fix(self, topic: str, at_s: float, lla: Sequence[float], status: int = 0) -> None:
+    def fix(self, topic: str, at_s: float, lla: Sequence[float], status: int = 0, **options: Any) -> None:
         kind = "sensor_msgs/msg/NavSatFix"
         state = self.make("sensor_msgs/msg/NavSatStatus", status, 1)
         covariance = np.diag([1.0, 1, 4]).ravel()
         message = self.make(kind, self.header(at_s, "gps"), state, *map(float, lla), covariance, 2)
-        self.write(topic, kind, message, at_s)
+        self.write(topic, kind, message, at_s, **options)
 
     def transform(
         self,

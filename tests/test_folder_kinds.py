@@ -252,6 +252,50 @@ def video(
     return path
 
 
+def set_rotation(path: Path, clockwise_deg: int) -> None:
+    """The matrix that a phone writes into an MP4 when it is held upright."""
+    content = bytearray(path.read_bytes())
+    matrix = content.index(b"tkhd") + 4 + 4 + 20 + 16
+    one = 1 << 16
+    turns = {90: (0, one, -one, 0), 180: (-one, 0, 0, -one), 270: (0, -one, one, 0)}
+    a, b, c, d = turns[clockwise_deg]
+    content[matrix : matrix + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(bytes(content))
+
+
+@pytest.mark.parametrize("clockwise_deg", [90, 180, 270])
+@pytest.mark.parametrize("lens", [None, (64, 48), (48, 64)])
+def test_rotation_flags_of_videos_are_said_and_followed_where_the_lens_is_so(
+    tmp_path: Path, clockwise_deg: int, lens: tuple[int, int] | None
+) -> None:
+    shades = np.linspace(20, 220, 48).astype(np.uint8)  # dark at the top as stored
+    path = tmp_path / "rec" / "front.mp4"
+    path.parent.mkdir()
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"qp": "10"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for _ in range(4):
+            image = np.repeat(np.repeat(shades[:, None, None], 64, 1), 3, 2)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24")))
+        container.mux(stream.encode(None))
+    set_rotation(path, clockwise_deg)
+    if lens is not None:
+        model = camera_from_params("pinhole", [50, 50, lens[0] / 2, lens[1] / 2, *[0] * 6], *lens)
+        write_cameras(path.with_name("rig.yaml"), {"front": model})
+    recording = open_recording(path.parent)
+    camera = recording.camera("front")
+    turned = clockwise_deg != 180 and lens == (48, 64)
+    assert (camera.width_px, camera.height_px) == ((48, 64) if turned else (64, 48))
+    assert said(recording, "rotation by")
+    frames = list(camera.frames())
+    assert len(frames) == 4
+    image = frames[0].image.astype(float)
+    assert image.shape == ((64, 48) if turned else (48, 64))
+    along = image.mean(axis=0 if turned else 1)  # clockwise: what was on top is at the right
+    assert (along[0] > along[-1]) == (turned and clockwise_deg == 90)
+    assert (camera.model is not None) == (turned or lens == (64, 48))
+
+
 def levels(path: Path, indices: list[int], count: int) -> list[int]:
     """Which frame each picture is, by its grey."""
     index = index_video(path)

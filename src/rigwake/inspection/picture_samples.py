@@ -11,9 +11,11 @@ import numpy as np
 from rigwake._types import Array, Image, Stamps
 from rigwake.cameras.protocol import CameraModel
 from rigwake.geometry import so3
-from rigwake.recording import CameraStream, Frame
+from rigwake.recording import CameraStream, EncodedFrameSource, Frame
 
 BURSTS, BURST_FRAMES = 5, 12
+MOST_CHECKED_FRAMES = 4000
+"""Of a whole recording: their bytes are read, at some hundred megabytes per second."""
 _DARK_LEVEL, _BRIGHT_LEVEL = 8, 250
 _BRIGHT_FRACTION = 0.5
 _MAX_WIDTH_PX = 480  # wider images are followed at a smaller size
@@ -83,6 +85,18 @@ def look_at_pictures(camera: CameraStream, advance: Callable[[int], None]) -> Pi
         np.array(ends, dtype=np.int64),
         np.array(turns).reshape(-1, 3),
     )
+
+
+def unreadable_frames(camera: CameraStream, most: int) -> tuple[int, int]:
+    """How many frames that lie encoded in the recording have no whole image, of how many that were looked at.
+
+    At most so many are, spread over the recording; none of a source that is not encoded. Pixels are not decoded.
+    """
+    if not (isinstance(camera.source, EncodedFrameSource) and camera.source.is_encoded and len(camera)):
+        return 0, 0
+    chosen = np.unique(np.linspace(0, len(camera) - 1, most).astype(np.int64))
+    whole = sum(1 for _ in camera.source.encoded_frames(chosen))
+    return len(chosen) - whole, len(chosen)
 
 
 def camera_rotation(first: Image, second: Image, model: CameraModel) -> Array | None:

@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 
 from rigwake._progress import CountProgress
-from rigwake.inspection.picture_samples import Pictures, look_at_pictures, sampled_indices
+from rigwake.inspection.picture_samples import (
+    MOST_CHECKED_FRAMES,
+    Pictures,
+    look_at_pictures,
+    sampled_indices,
+    unreadable_frames,
+)
 from rigwake.inspection.time_offsets import SensorTimeOffset, camera_offset, gnss_offset
 from rigwake.inspection.timing import Timing, timing
 from rigwake.inspection.vessel_motion import Travel, Turning, travel, turning
@@ -23,7 +29,7 @@ _GRAVITY_RANGE = (8.5, 11.0)
 class Inspection:
     """What `inspect_recording` found. Sensors by `kind.name`: `camera.front`, `imu.imu`, `gnss.gps`.
 
-    turning, travel: of the first IMU and the first GNSS, None where there is none. findings: of the reader,
+    turning, travel: of the IMU and the GNSS that every verb uses, None where there is none. findings: of the reader,
     and what was measured here.
     """
 
@@ -48,6 +54,7 @@ def inspect_recording(recording: Recording, progress: CountProgress | None = Non
     path = travel(gnss) if gnss is not None else None
     time_offsets = _time_offsets(imu, gnss, pictures)
     findings = (*recording.findings, *_timing_findings(timings), *_picture_findings(pictures))
+    findings += tuple(_unreadable_findings(recording))
     findings += (*_imu_findings(recording), *_time_offset_findings(time_offsets, timings))
     return Inspection(recording, timings, pictures, turn, path, time_offsets, findings)
 
@@ -124,6 +131,19 @@ def _picture_findings(pictures: Mapping[str, Pictures]) -> list[Finding]:
                 severity = "error" if count > 0.5 * p.sampled else "warning"
                 message = f"{count} of {p.sampled} sampled frames {what}."
                 findings.append(Finding(severity, f"camera.{name}", message))
+    return findings
+
+
+def _unreadable_findings(recording: Recording) -> list[Finding]:
+    findings = []
+    most = MOST_CHECKED_FRAMES // max(len(recording.cameras), 1)
+    for name, camera in recording.cameras.items():
+        lost, checked = unreadable_frames(camera, most)
+        if lost:
+            message = f"{lost} of {checked} encoded frames are cut off, damaged or of another size: left out."
+            findings.append(
+                Finding("error" if lost > 0.5 * checked else "warning", f"camera.{name}", message)
+            )
     return findings
 
 

@@ -239,7 +239,7 @@ class Logbook:
                 "SELECT id, valid_from_ns, valid_to_ns, added_ns, supersedes, note, sha256 FROM calibration "
                 "ORDER BY valid_from_ns"
             ).fetchall()
-        return [LoggedCalibration(*row) for row in rows]
+            return [LoggedCalibration(*row) for row in rows]
 
     def find(self, calibration: Calibration) -> int | None:
         """The number of this very calibration, None if it was never logged."""
@@ -289,7 +289,7 @@ class Logbook:
                 "FROM verdict WHERE ? IS NULL OR camera = ? ORDER BY begin_ns, id",
                 (camera, camera),
             ).fetchall()
-        return [replace(LoggedVerdict(*row[:9]), evidence=json.loads(row[9])) for row in rows]
+            return [replace(LoggedVerdict(*row[:9]), evidence=json.loads(row[9])) for row in rows]
 
     def copy_to(self, path: Path) -> None:
         """A consistent copy, also while others write."""
@@ -305,6 +305,12 @@ def _told(path: Path) -> Iterator[None]:
         yield
     except sqlite3.Error as error:
         raise _failure(path, error) from error
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:  # of what a row holds
+        raise InputError(
+            f"{path} is a damaged logbook ({type(error).__name__}: {error}).",
+            consequence="It was left as it is.",
+            remedy="Restore it from a copy (`rigwake log export`).",
+        ) from error
 
 
 def _failure(path: Path, error: sqlite3.Error) -> RigwakeError:

@@ -27,14 +27,7 @@ def bridged(
     gnss: GnssStream | None = None,
 ) -> tuple[str, ...]:
     """One line for each thing that was missing within the camera's time, or contradicted the rest; none if nothing."""
-    lines = []
-    if tracks.report is not None:
-        counts = {
-            "black or empty": tracks.report.frames_black,
-            "repeated": tracks.report.frames_repeated,
-            "unreadable": tracks.report.frames_missing,
-        }
-        lines += [f"{n} {kind} {_plural('frame', n)} bridged" for kind, n in counts.items() if n]
+    lines = list(frames_not_tracked(tracks))
     stamps = tracks.timestamps_ns
     lines += _gaps("images", stamps, stamps)
     lines += _gaps("IMU samples", imu.timestamps_ns, stamps) if imu is not None else []
@@ -42,6 +35,18 @@ def bridged(
     if visual is not None:
         lines += _moving(tracks, camera, visual)
     return tuple(lines)
+
+
+def frames_not_tracked(tracks: Tracks) -> tuple[str, ...]:
+    """One line for each kind of frame that was given but not tracked, with their number; none if all were."""
+    if tracks.report is None:
+        return ()
+    counts = {
+        "black or empty": tracks.report.frames_black,
+        "repeated": tracks.report.frames_repeated,
+        "unreadable": tracks.report.frames_missing,
+    }
+    return tuple(f"{n} {kind} {_plural('frame', n)} bridged" for kind, n in counts.items() if n)
 
 
 def _gaps(what: str, stamps: Stamps, span: Stamps) -> list[str]:

@@ -17,6 +17,7 @@ from rigwake.atomic import write_text_atomic
 from rigwake.calibration.yaml_file import plain
 from rigwake.config import CalibrateConfig
 from rigwake.errors import HostError, InputError, RigwakeError
+from rigwake.odometry.bridged import frames_not_tracked
 from rigwake.odometry.measure import measure_camera
 from rigwake.odometry.monocular import estimate_monocular
 from rigwake.recording import CameraStream, ImuStream
@@ -150,4 +151,5 @@ def _process(job: CameraJob, report_stage: StageProgress, *, horizon: bool = Tru
         )
         write_tum(result.trajectory, odometry_file(job.out, stream.name))
         counts["odometry"] = asdict(result.counts)
-    return CameraOutcome(stream.name, None, notes=measured.notes, counts=counts)
+    notes = (*measured.notes, *frames_not_tracked(tracks))
+    return CameraOutcome(stream.name, None, notes=notes, counts=counts)

@@ -74,7 +74,11 @@ def select(recording: Recording, config: CalibrateConfig) -> Selection:
             consequence=f"Under {config.min_duration_s:g} s no vessel turns enough to tell where its cameras are.",
             remedy="Record one to two minutes with turns to both sides.",
         )
-    notes: list[str] = []
+    notes = [
+        f"{f.sensor + ': ' if f.sensor else ''}{f.message}"
+        for f in recording.findings
+        if f.severity != "note"
+    ]
     imu = _one("IMU", main_imu(recording), recording.imus, config.imu, notes)
     gnss = _one("GNSS receiver", main_gnss(recording), recording.gnss, config.gnss, notes)
     notes.extend(

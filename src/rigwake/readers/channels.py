@@ -15,6 +15,7 @@ import numpy as np
 
 from rigwake._types import Stamps
 from rigwake.errors import InputError
+from rigwake.readers.clock_steps import set_back_rows
 from rigwake.recording import Finding
 
 Encoding = Literal["ros1", "cdr"]
@@ -87,22 +88,26 @@ class HeldPayloads:
         return (self.messages[row][:limit_bytes] for row in rows)
 
 
-def joined(channels: Sequence[Channel]) -> tuple[Channel, ...]:
+def joined(channels: Sequence[Channel], *, of_files: bool = False) -> tuple[Channel, ...]:
     """One channel per (topic, type), in the order of recording.
 
-    Connections of several publishers and files of a split bag are merged by the time of recording.
+    Connections of several publishers and files of a split bag (of_files, in their order) are merged by the time of
+    recording; messages of one publisher, and those files, stay in their order where the clock was set back.
     """
     groups: dict[tuple[str, str], list[Channel]] = {}
     for channel in channels:
         groups.setdefault((channel.topic, channel.message_type), []).append(channel)
-    return tuple(_join(group) for group in groups.values())
+    return tuple(_join(group, of_files) for group in groups.values())
 
 
-def _join(group: Sequence[Channel]) -> Channel:
+def _join(group: Sequence[Channel], of_files: bool) -> Channel:
     times = np.concatenate([c.log_times_ns for c in group])
-    if len(group) == 1 and (np.diff(times) >= 0).all():
+    if (len(group) == 1 or of_files) and len(set_back_rows(times)):
+        order = np.arange(len(times))
+    else:
+        order = np.argsort(times, kind="stable")
+    if len(group) == 1 and (np.diff(order) == 1).all():
         return group[0]
-    order = np.argsort(times, kind="stable")
     part_of = np.repeat(np.arange(len(group)), [len(c) for c in group])
     part_rows = np.concatenate([np.arange(len(c)) for c in group])
     return replace(

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from rigwake.errors import InputError
 from rigwake.readers.channels import MAX_MESSAGE_BYTES
+from rigwake.readers.clock_steps import set_back_rows
 
 Framing = Literal["ros1", "mcap"]
 
@@ -194,7 +195,8 @@ def payloads_in_order(
     parts: Sequence[tuple[int, int, NDArray[np.int64]]],
     times_ns: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], ChunkedPayloads]:
-    """The times, and the messages, in the order of recording.
+    """The times, and the messages, in the order of recording: that of their times, and of the file where the clock was
+    set back while recording.
 
     parts: owner, chunk row and offsets (n,) of messages of one topic; times_ns: of all of them, part after part.
     """
@@ -202,7 +204,9 @@ def payloads_in_order(
     offsets = np.concatenate([np.empty(0, np.int64), *(offsets for _, _, offsets in parts)])
     chunk_rows = np.repeat([row for _, row, _ in parts], counts).astype(np.int32)
     owners = np.repeat([owner for owner, _, _ in parts], counts).astype(np.int64)
-    order = np.lexsort((offsets, chunk_rows, times_ns))
+    order = np.lexsort((offsets, chunk_rows))
+    if not len(set_back_rows(times_ns[order])):
+        order = order[np.argsort(times_ns[order], kind="stable")]
     payloads = ChunkedPayloads(path, framing, tuple(chunks), chunk_rows[order], offsets[order], owners[order])
     return times_ns[order], payloads
 

@@ -10,7 +10,19 @@ from collections.abc import Sequence
 
 from rigwake.readers.stamp_units import UNIT_OF_WORD
 
-_POSITION = {"p", "t", "pos", "position", "positions", "translation", "trans", "location", "loc", "tr"}
+_POSITION = {
+    "p",
+    "t",
+    "pos",
+    "position",
+    "positions",
+    "translation",
+    "trans",
+    "location",
+    "loc",
+    "tr",
+    "pose",
+}
 _ROTATION = {"q", "quat", "quaternion", "orientation", "rot", "rotation", "att", "attitude", "ori"}
 _OTHER = (
     {"v", "vel", "velocity", "twist", "linear", "angular", "bias", "b", "bg", "ba", "bw", "cov", "covariance"}
@@ -18,6 +30,7 @@ _OTHER = (
     | {"variance", "var", "gravity", "mag"}
 )
 _AXES = {"x": "x", "y": "y", "z": "z", "w": "w"}
+_IMAGINARY = {"i": "x", "j": "y", "k": "z", "real": "w", "re": "w", "scalar": "w"}
 _INDEXED = {"position": {"0": "x", "1": "y", "2": "z"}, "rotation": {"0": "w", "1": "x", "2": "y", "3": "z"}}
 _TIMES = {"t", "time", "timestamp", "timestamps", "stamp", "secs", "sec", "seconds", "times", "datetime"}
 _TIME_PREFIXES = {
@@ -102,6 +115,8 @@ def _axis_of(tokens: Sequence[str]) -> str:
     if not kind and not before:
         kind = "rotation" if last == "w" else "position"
     axis = _AXES.get(last) or _INDEXED.get(kind, {}).get(last, "")
+    if kind == "rotation":
+        axis = axis or _IMAGINARY.get(last, "")
     if not axis or kind in ("other", "") or (kind == "position" and axis == "w"):
         return ""
     return f"q{axis}" if kind == "rotation" else axis

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rigwake._types import Array, Stamps
 from rigwake.errors import InputError
 from rigwake.geometry import so3
+from rigwake.readers.column_names import metres_per_unit
 from rigwake.readers.csv_tables import Table, read_table
 from rigwake.readers.gnss_fixes import gnss_stream_of_fixes
 from rigwake.readers.imu_units import (
@@ -30,13 +31,16 @@ _LATITUDE_LONGITUDE = (
     ("lat", "lon"),
     ("lat", "lng"),
     ("lat", "long"),
-    ("latitude_deg", "longitude_deg"),
-    ("lat_deg", "lon_deg"),
 )
-_HEIGHT = (
-    *("altitude", "alt", "height", "ellipsoidal_height", "hgt", "elevation"),
-    *("altitude_m", "alt_m", "height_m"),
+_LATITUDE_LONGITUDE += tuple(
+    (f"{latitude}_{unit}", f"{longitude}_{unit}")
+    for unit in ("deg", "rad", "e7")
+    for latitude, longitude in _LATITUDE_LONGITUDE
 )
+_HEIGHT = ("altitude", "alt", "height", "ellipsoidal_height", "hgt", "elevation", "h")
+_HEIGHT += tuple(f"{name}_{unit}" for unit in ("m", "mm", "cm", "ft") for name in _HEIGHT)
+_RADIANS = ("rad", "radian", "radians")
+_TEN_MILLIONTHS = ("1e-7 deg", "1e-7deg", "1e-7", "deg*1e-7", "deg*1e7", "dege7", "dege-7", "e7", "1e7 deg")
 _ENU_COVARIANCE = ("cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu")
 _BODY_COVARIANCE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 _UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
@@ -109,13 +113,31 @@ def _inertial_columns(table: Table, name: str) -> tuple[tuple[str, ...], tuple[s
     return *found, ()
 
 
+def _places(table: Table, name: str) -> tuple[Array, Findings]:
+    """(N, 3) latitude, longitude (degrees) and height (metres, NaN without one), whatever the units."""
+    columns = next((pair for pair in _LATITUDE_LONGITUDE if all(n in table.columns for n in pair)), None)
+    place = table.numbers(*_LATITUDE_LONGITUDE)
+    assert columns is not None
+    unit = table.units[columns[0]] or columns[0].rpartition("_")[2]
+    findings: Findings = ()
+    largest = float(np.nanmedian(np.abs(place[:, 0]))) if np.isfinite(place[:, 0]).any() else 0.0
+    if unit in _RADIANS:
+        place = np.degrees(place)
+    elif unit in _TEN_MILLIONTHS or (largest > 1e5 and unit not in ("deg", "degrees", "°")):
+        place = 1e-7 * place
+        words = "latitude and longitude are in units of 1e-7 degrees, as u-blox has them: converted."
+        findings = (Finding("note", name, words),)
+    height = table.find(*_HEIGHT)
+    if height is None:
+        return np.column_stack([place, np.full(len(place), np.nan)]), findings
+    named = height if not table.units[height] else f"{height} [{table.units[height]}]"
+    return np.column_stack([place, metres_per_unit(named) * table.numbers((height,))]), findings
+
+
 def read_gnss_csv(path: Path, name: str) -> tuple[GnssStream, Findings]:
     """Satellite positions in the plane tangent at the first. Raises InputError as `read_imu_csv`."""
     table = read_table(path)
-    place = table.numbers(*_LATITUDE_LONGITUDE)
-    height = table.find(*_HEIGHT)
-    heights = table.numbers((height,)) if height else np.full((len(place), 1), np.nan)
-    lla = np.concatenate([place, heights], axis=1)
+    lla, said = _places(table, name)
     readable, dropped = _readable(table, name)
     velocity_columns = ("velocity_e", "velocity_n", "velocity_u")
     velocity = table.numbers(velocity_columns)[readable] if table.find(velocity_columns[0]) else None
@@ -127,7 +149,7 @@ def read_gnss_csv(path: Path, name: str) -> tuple[GnssStream, Findings]:
         velocity_enu=velocity,
         topic=path.name,
     )
-    return stream, (*dropped, *findings)
+    return stream, (*said, *dropped, *findings)
 
 
 def read_attitude_csv(path: Path, name: str) -> tuple[AttitudeStream, Findings]:

@@ -13,14 +13,15 @@ from rigwake._types import Array, Stamps
 from rigwake.errors import InputError
 from rigwake.readers.column_names import name_and_unit
 from rigwake.readers.stamp_units import NS_PER_UNIT, UNIT_OF_WORD, stamps_from_text
-from rigwake.readers.trajectory_rows import cells_of, is_number
+from rigwake.readers.trajectory_rows import cells_of, is_number, with_decimal_point
 from rigwake.text_files import read_text_file
 
 _SECOND_NAMES = ("sec", "secs", "header.stamp.sec", "header.stamp.secs", "stamp.sec", "timestamp.sec")
 _NANO_NAMES = ("nanosec", "nsec", "nsecs", "header.stamp.nanosec", "header.stamp.nsecs", "stamp.nanosec")
 _STAMP_NAMES = (
     *("timestamp", "field.header.stamp", "header.stamp", "rosbagtimestamp", "time", "stamp", "t", "__time"),
-    *("epoch", "unix_time", "timestamps", *_SECOND_NAMES),
+    *("epoch", "unix_time", "timestamps", *_SECOND_NAMES, "utc", "datetime", "date_time", "utc_time"),
+    *("time_utc", "timestamp_utc", "date"),
 )
 _COMMENTS = ("#", "%", "//")
 _MAX_TABLE_BYTES = 2**30
@@ -128,7 +129,7 @@ def read_table(path: Path, names: Sequence[str] = ()) -> Table:
 
 
 def _separator(line: str) -> str:
-    return next((sign for sign in (",", ";", "\t") if sign in line), " ")
+    return next((sign for sign in (";", "\t", ",") if sign in line), " ")
 
 
 def _split(lines: Sequence[str], separator: str) -> list[list[str]]:
@@ -137,6 +138,8 @@ def _split(lines: Sequence[str], separator: str) -> list[list[str]]:
     if separator == " ":
         return [list(cells_of(line)[0]) for line in stripped]
     rows = [row for row in csv.reader(stripped, delimiter=separator, skipinitialspace=True) if row]
+    if separator != ",":
+        rows = [[with_decimal_point(cell) for cell in row] for row in rows]
     return [
         row[:-1] if len(row) > 2 and not row[-1].strip() and line.endswith(separator) else row
         for row, line in zip(rows, stripped, strict=False)

@@ -135,6 +135,9 @@ def _mention(entry: Path, found: _FolderStreams) -> None:
 def _adder(entry: Path) -> Callable[[Path, _FolderStreams], None] | None:
     suffix = entry.suffix.lower()
     if entry.is_dir():
+        kind = _table_of(entry / f"{entry.name}.csv")
+        if kind is not None and (entry / "data.csv").is_file():  # as in EuRoC
+            return lambda folder, found: _ADD_TABLE[kind](folder / "data.csv", found)
         return _add_images if image_files(entry) else None
     if not entry.is_file():
         return None
@@ -156,6 +159,7 @@ def _holds_nmea(entry: Path) -> bool:
 def _free_name(entry: Path, taken: Mapping[str, object], found: _FolderStreams) -> str:
     """The stem of a file or folder; where another sensor has it, the suffix is added, and that is said."""
     name = entry.stem if entry.is_file() else entry.name
+    name = entry.parent.name if name == "data" and entry.parent != found.root else name
     if name not in taken:
         return name
     longer = f"{name}_{entry.suffix.lstrip('.').lower() or 'folder'}"

@@ -48,7 +48,7 @@ def gnss_stream_of_fixes(
     if no_height.any():
         known = lla[high & np.isfinite(lla[:, 0]), 2]
         lla[no_height, 2] = np.median(known) if len(known) else 0.0
-        message = f"{int(no_height.sum())} of {len(lla)} fixes hold no height: there it is taken as unknown."
+        message = f"{int(no_height.sum())} fixes have no altitude (of {len(lla)}): no height is known there."
         findings.append(Finding("warning", name, message))
     rows, repaired = usable_rows(name, timestamps_ns, lla)
     if not len(rows):

@@ -51,12 +51,17 @@ def sentences(path: Path) -> Iterator[Sentence]:
     with path.open("rb") as file:
         while line := file.readline(_MAX_LINE):
             if b"$" in line or b"!" in line:
-                yield from _sentences_of(line)
+                yield from _sentences_of(_without_zeros(line))
+
+
+def _without_zeros(text: bytes) -> bytes:
+    """Text of two bytes a character (UTF-16, as PowerShell redirects it) as one byte each; other bytes as they are."""
+    return text.replace(b"\0", b"") if text.count(b"\0") > len(text) // 3 else text
 
 
 def looks_like_nmea(start: bytes) -> bool:
     """Whether the first bytes of a file hold a sentence: one with a right checksum, or of a well-known kind."""
-    for match in _SENTENCE.finditer(start[:65536]):
+    for match in _SENTENCE.finditer(_without_zeros(start[:65536])):
         is_known = match[1][-3:] in _KNOWN
         if match[3] is None:
             if is_known and match[2].count(b",") >= 3 and match.start() == 0:

@@ -9,6 +9,7 @@ from pathlib import Path
 from rigwake.errors import InputError
 from rigwake.excerpt import longest_stretch
 from rigwake.readers.channels import BagIndex
+from rigwake.readers.clock_steps import on_one_clock
 from rigwake.readers.euroc_folder import euroc_root, read_euroc
 from rigwake.readers.folder import is_plain_folder, read_folder
 from rigwake.readers.kitti import is_kitti_odometry, is_kitti_raw, read_kitti_odometry, read_kitti_raw
@@ -63,10 +64,12 @@ def open_recording(path: Path | str, topics: TopicMap | None = None) -> Recordin
             recording = with_description(named, description)
     except InputError as error:
         recording = replace(recording, findings=(*recording.findings, Finding("warning", "", error.cause)))
-    return longest_stretch(with_chosen_lenses(recording, topics.lenses))
+    return longest_stretch(on_one_clock(with_chosen_lenses(recording, topics.lenses)))
 
 
 def _read(path: Path, topics: TopicMap) -> Recording:
+    if "\0" in str(path):
+        raise InputError("The path of the recording holds a NUL character.", remedy="Check the path.")
     try:
         if not path.exists():
             raise InputError(f"There is no {path}.", remedy="Check the path.")
@@ -85,9 +88,8 @@ def _read(path: Path, topics: TopicMap) -> Recording:
             with path.open("rb") as file:
                 if looks_like_nmea(file.read(_START_BYTES)):
                     return nmea_recording(path)
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-        words = error.strerror if isinstance(error, OSError) else str(error)
-        raise InputError(f"{path!s:.200} cannot be read: {words}.") from error
+    except OSError as error:
+        raise InputError(f"{path!s:.200} cannot be read: {error.strerror}.") from error
     raise InputError(f"{path} is not a recording that rigwake knows.", remedy=_KNOWN)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -117,7 +118,10 @@ def image_format(payload: bytes, channel: Channel) -> ImageFormat:
             return ImageFormat(ImageSize(0, 0), encoding, True)
         return ImageFormat(compressed_size(message.data[: 2**16].tobytes()), encoding, False)
     encoding = str(message.encoding)
-    if encoding.strip().lower() in DEPTH_ENCODINGS:
+    is_deep_grey = encoding.strip().lower() in ("mono16", "y16") and "depth" in re.split(
+        r"[/_]", channel.topic.lower()
+    )
+    if is_deep_grey or encoding.strip().lower() in DEPTH_ENCODINGS:
         return ImageFormat(checked_size(message.width, message.height), encoding, True)
     if encoding.lower() in _ENCODED:
         return ImageFormat(compressed_size(message.data[: 2**16].tobytes()), encoding, False)

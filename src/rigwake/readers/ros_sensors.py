@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigwake._types import Array, Stamps
 from rigwake.errors import InputError
-from rigwake.geometry.geodesy import enu_from_lla
 from rigwake.geometry.se3 import SE3
 from rigwake.readers.channels import Channel
+from rigwake.readers.gnss_fixes import gnss_stream_of_fixes
 from rigwake.readers.ros_decoding import (
     MAX_SENSOR_BYTES,
     decode_all,
@@ -20,14 +19,12 @@ from rigwake.readers.ros_decoding import (
     trailing_doubles,
     whole_payloads,
 )
-from rigwake.readers.streams import LARGEST_VALUE, symmetric_psd, unit_quaternions, usable_rows
+from rigwake.readers.streams import LARGEST_VALUE, unit_quaternions, usable_rows
 from rigwake.recording import Finding, GnssStream
 from rigwake.trajectory import Trajectory
 
 FIX = "sensor_msgs/msg/NavSatFix"
 STANDARD_GRAVITY = 9.80665
-_UNKNOWN_GNSS_VARIANCE = 25.0  # m^2, an unaided receiver; used where a fix states no covariance
-_UNKNOWN_HEIGHT_VARIANCE = 1e6  # m^2
 _NO_FIX = -1
 
 Findings = tuple[Finding, ...]
@@ -43,56 +40,25 @@ def read_fix(name: str, channel: Channel) -> tuple[GnssStream, Findings]:
     messages = dict(decode_all(channel, MAX_SENSOR_BYTES))
     kept = [at for at, row in enumerate(stamped.rows) if row in messages]
     fixes = [messages[stamped.rows[at]] for at in kept]
+    there = np.array([fix.status.status != _NO_FIX for fix in fixes], dtype=bool)
     lla = np.array([(fix.latitude, fix.longitude, fix.altitude) for fix in fixes]).reshape(-1, 3)
-    without = np.array([fix.status.status == _NO_FIX for fix in fixes], dtype=bool)
-    null_island = (lla[:, :2] == 0).all(axis=1) & ~without
-    plausible = (np.abs(lla[:, 0]) <= 90) & (np.abs(lla[:, 1]) <= 360)
-    flat = np.isnan(lla[:, 2]) & plausible
-    lla[flat, 2] = float(np.median(lla[~flat & plausible, 2])) if (~flat & plausible).any() else 0.0
-    dropped = without | null_island
-    good = np.flatnonzero(~dropped)
-    lla[~plausible] = np.nan
-    usable, repaired = usable_rows(name, stamped.timestamps_ns[kept][good], lla[good])
-    rows = good[usable]
-    if not len(rows):
-        raise InputError(f"{channel.topic} holds no valid fix.")
-    covariances = np.array([fixes[row].position_covariance for row in rows]).reshape(-1, 3, 3)
-    unknown = np.array([fixes[row].position_covariance_type == 0 for row in rows])
+    covariances = np.array([fix.position_covariance for fix in fixes]).reshape(-1, 3, 3)
+    unknown = np.array([fix.position_covariance_type == 0 for fix in fixes], dtype=bool)
     covariances[unknown] = 0.0
-    origin = (float(lla[rows[0], 0]), float(lla[rows[0], 1]), float(lla[rows[0], 2]))
-    stream = GnssStream(
+    stream, findings = gnss_stream_of_fixes(
         name,
-        stamped.timestamps_ns[kept][rows],
-        enu_from_lla(lla[rows], origin),
-        _covariances(covariances, flat[rows]),
-        origin,
+        stamped.timestamps_ns[kept][there],
+        lla[there],
+        covariances[there],
         topic=channel.topic,
         frame_id=stamped.frame_id,
     )
     counted = (
-        ("note", int(without.sum()), "messages say that there is no fix; they were dropped."),
-        (
-            "warning",
-            int(null_island.sum()),
-            "fixes lie at latitude and longitude 0: no position yet; dropped.",
-        ),
-        ("warning", int(flat[rows].sum()), "fixes have no altitude: their height is unknown."),
-        ("note", int(unknown.sum()), "fixes state no covariance; 5 m per axis is assumed."),
+        (int((~there).sum()), "messages say that there is no fix; they were dropped."),
+        (int((unknown & there).sum()), "fixes state no covariance; 5 m per axis is assumed."),
     )
-    remarks = [Finding(severity, name, f"{count} {words}") for severity, count, words in counted if count]
-    return stream, (*stamped.findings, *repaired, *remarks)
-
-
-def _covariances(stated: Array, flat: NDArray[np.bool_]) -> Array:
-    """(N, 3, 3) with unknown ones replaced, and heights that are unknown marked so."""
-    horizontal = stated[flat].copy()
-    horizontal[:, 2, :] = horizontal[:, :, 2] = 0.0
-    horizontal[:, 2, 2] = _UNKNOWN_HEIGHT_VARIANCE
-    covariances = stated.copy()
-    covariances[flat] = horizontal
-    covariances = symmetric_psd(covariances, _UNKNOWN_GNSS_VARIANCE)
-    covariances[flat, 2, 2] = _UNKNOWN_HEIGHT_VARIANCE
-    return covariances
+    remarks = [Finding("note", name, f"{count} {words}") for count, words in counted if count]
+    return stream, (*stamped.findings, *findings, *remarks)
 
 
 _VELOCITY_NUMBERS = {"geometry_msgs/msg/TwistStamped": 6, "geometry_msgs/msg/TwistWithCovarianceStamped": 42}

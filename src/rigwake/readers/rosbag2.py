@@ -222,7 +222,7 @@ def index_rosbag2_folder(folder: Path) -> BagIndex:
         causes = " ".join(finding.message for finding in findings) or "It names no files."
         raise InputError(f"No file of the ROS 2 bag {folder.name} can be read. {causes}")
     kind = "ros2 mcap bag" if bags[0].kind == "mcap" else bags[0].kind
-    channels = joined([channel for bag in bags for channel in bag.channels])
+    channels = joined([channel for bag in bags for channel in bag.channels], of_files=True)
     return BagIndex(kind, channels, (*findings, *(f for bag in bags for f in bag.findings)))
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from datetime import datetime
 from decimal import Decimal, InvalidOperation
 
 import numpy as np
@@ -21,6 +23,12 @@ _YEAR_1990_S, _YEAR_2103_S = 6.3e8, 4.2e9
 _LONGEST_STEP_S = 1e5
 # Without a date the step tells: 2 ms to 2 s between samples, in the unit in which it is 2 to 2000
 _SMALLEST_STEP = {"ns": 2e6, "us": 2e3, "ms": 2.0}
+_NO_NUMBER = re.compile(
+    r"[-+]?nan(\(\w*\))?|[-+]?1\.#(qnan|snan|ind|inf)\d*|null|none|n/?a|nil|<?missing>?", re.IGNORECASE
+)
+_DATE = re.compile(
+    r"(\d{4}[-/]\d\d[-/]\d\d[T ]\d\d:\d\d:\d\d)([.,]\d{1,12})?\s*(Z|[-+]\d\d:?\d\d)?", re.ASCII
+)
 _LARGEST_NS = Decimal(2**62)
 
 
@@ -49,6 +57,22 @@ def unit_of_times(values: Array) -> str:
     return "s"
 
 
+def plain_number(cell: str) -> str:
+    """A cell as a number that Python reads: a date as seconds since 1970 (UTC where it names no zone), the many words
+    for "no number" as nan; anything else as it is."""
+    if not cell or _NO_NUMBER.fullmatch(cell):
+        return "nan"
+    found = _DATE.fullmatch(cell)
+    if found is None:
+        return cell
+    try:
+        zone = "+00:00" if found[3] in (None, "Z") else found[3]
+        whole = datetime.fromisoformat(f"{found[1].replace(' ', 'T').replace('/', '-')}{zone}")
+    except ValueError:
+        return cell
+    return f"{round(whole.timestamp())}{(found[2] or '').replace(',', '.')}"
+
+
 def decimal_or_none(cell: str) -> Decimal | None:
     """The exact number in a cell; None if it is none, not finite or absurdly large."""
     try:
@@ -65,8 +89,12 @@ def unit_of_cells(values: Sequence[Decimal | None]) -> str:
 
 def stamps_from_text(cells: Sequence[str], unit: str = "") -> Stamps:
     """Integer nanoseconds of times in text; unreadable or absurd ones are -1. Without a unit see `unit_of_times`."""
-    values = [decimal_or_none(cell) for cell in cells]
-    factor = NS_PER_UNIT[unit or unit_of_cells(values)]
+    plain = [plain_number(cell.strip()) for cell in cells]
+    values = [decimal_or_none(cell) for cell in plain]
+    is_date = any(
+        before != after and after != "nan" for before, after in zip(map(str.strip, cells), plain, strict=True)
+    )
+    factor = NS_PER_UNIT["s" if is_date else unit or unit_of_cells(values)]
     stamps = (None if value is None else value * factor for value in values)
     exact = [-1 if ns is None or not 0 <= ns < _LARGEST_NS else round(ns) for ns in stamps]
     return np.array(exact, dtype=np.int64)

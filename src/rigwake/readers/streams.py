@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigwake._types import Array, Indices, Stamps
+from rigwake.readers.clock_steps import longest_between_steps
 from rigwake.recording import Finding
 
 LARGEST_VALUE = 1e9
@@ -14,12 +15,13 @@ LARGEST_VALUE = 1e9
 
 def time_order(sensor: str, timestamps_ns: Stamps) -> tuple[Indices, list[Finding]]:
     """Indices that put the stamps in strictly increasing order (of equal stamps the first stays), and what
-    that repaired."""
+    that repaired. Of a clock that was set back the longest stretch stays (`clock_steps`)."""
     stamps = np.asarray(timestamps_ns, dtype=np.int64)
+    kept, findings = longest_between_steps(sensor, stamps)
+    first, stamps = kept.start or 0, stamps[kept]
     steps = np.diff(stamps)
     order = np.argsort(stamps, kind="stable")
     fresh = np.concatenate([[True], np.diff(stamps[order]) > 0])[: len(order)]
-    findings = []
     if (backward := int((steps < 0).sum())) > 0:
         worst_s = -float(steps.min()) * 1e-9
         severity = "error" if worst_s > 1.0 else "warning"
@@ -28,7 +30,7 @@ def time_order(sensor: str, timestamps_ns: Stamps) -> tuple[Indices, list[Findin
     if (duplicates := int((~fresh).sum())) > 0:
         message = f"{duplicates} samples repeat the stamp of another; the first of each was kept."
         findings.append(Finding("warning", sensor, message))
-    return order[fresh], findings
+    return first + order[fresh], findings
 
 
 def sane_rows(sensor: str, *columns: ArrayLike) -> tuple[Indices, list[Finding]]:
