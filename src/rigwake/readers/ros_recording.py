@@ -49,6 +49,11 @@ _ROLE_TYPES = {"camera": IMAGE_TYPES, "imu": {IMU}, "gnss": {FIX}, "pose": POSE_
 _UNDERSTOOD = frozenset().union(*_ROLE_TYPES.values(), {INFO}, TF_TYPES, VELOCITY_TYPES)
 
 
+def is_read(topic: str, message_type: str) -> bool:
+    """Whether `recording_from_bag` makes anything of such a topic; message_type: `package/msg/Name`."""
+    return message_type in _UNDERSTOOD or (topic == RIG_TOPIC and message_type == _STRING)
+
+
 @dataclass
 class _RosStreams:
     """Sensors gathered while going through the topics."""

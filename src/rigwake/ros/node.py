@@ -17,14 +17,15 @@ import numpy as np
 
 from rigwake.calibration import Calibration, load_calibration
 from rigwake.errors import HostError, RigwakeError
+from rigwake.readers.ros_recording import is_read
 from rigwake.readers.topics import camera_base
 from rigwake.ros.child_command import ChildCommand
-from rigwake.ros.recorder import BagRecorder, OpeningMessages
+from rigwake.ros.recorder import BagRecorder, OpeningMessages, is_sent_once
 from rigwake.ros.topic_watch import TopicWatch
 from rigwake.ros.transport import (
     COMPRESSED_IMAGE,
     IMAGE,
-    SENSOR_TYPES,
+    STRING,
     TRANSFORMS,
     Answer,
     NodeStatus,
@@ -100,8 +101,10 @@ class RigwakeNode:
         known = self._transport.topics()
         for topic, message_type in chosen_topics(known, self._options.topics).items():
             if topic not in self._watches:
-                is_stamped = message_type != TRANSFORMS
-                self._watches[topic] = TopicWatch(topic, is_stamped=is_stamped)
+                is_stamped = message_type not in (TRANSFORMS, STRING)
+                self._watches[topic] = TopicWatch(
+                    topic, is_stamped=is_stamped, is_sent_once=is_sent_once(topic)
+                )
                 self._transport.subscribe(topic, message_type, self._received)
 
     def _received(self, message: ReceivedMessage) -> None:
@@ -317,8 +320,9 @@ def _remove(bag: Path) -> None:
 
 
 def chosen_topics(known: dict[str, str], only: Sequence[str]) -> dict[str, str]:
-    """What is subscribed: sensors' topics; of a camera that is sent raw and compressed, the compressed one."""
-    sensors = {topic: kind for topic, kind in known.items() if kind in SENSOR_TYPES}
+    """What is subscribed: all that the readers understand, so that a bag of the node gives what the topics gave; of a
+    camera that is sent raw and compressed, the compressed one."""
+    sensors = {topic: kind for topic, kind in known.items() if is_read(topic, kind)}
     if only:
         return {topic: kind for topic, kind in sensors.items() if topic in only}
     packed = {camera_base(topic) for topic, kind in sensors.items() if kind == COMPRESSED_IMAGE}

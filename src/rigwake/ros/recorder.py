@@ -16,6 +16,7 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 from rigwake.errors import HostError
 from rigwake.readers.channels import Encoding
+from rigwake.readers.rig_description import RIG_TOPIC
 from rigwake.readers.ros_decoding import typestore
 from rigwake.ros.transport import CAMERA_INFO, TRANSFORMS, ReceivedMessage
 
@@ -91,9 +92,7 @@ class BagRecorder:
 
     def _write(self, message: ReceivedMessage) -> None:
         if message.topic not in self._connections:
-            latched = (
-                {"latching": 1} if self._encoding == "ros1" and message.topic.endswith("/tf_static") else {}
-            )
+            latched = {"latching": 1} if self._encoding == "ros1" and is_sent_once(message.topic) else {}
             self._connections[message.topic] = self._writer.add_connection(
                 message.topic, message.message_type, typestore=typestore(self._encoding), **latched
             )
@@ -125,8 +124,13 @@ def _forget_written(writer: Any) -> None:
         chunk.connections = {number: range(len(places)) for number, places in chunk.connections.items()}
 
 
+def is_sent_once(topic: str) -> bool:
+    """Whether silence on this topic is as it should be: it is latched."""
+    return topic.endswith("/tf_static") or topic == RIG_TOPIC
+
+
 class OpeningMessages:
-    """Keeps what is sent once but belongs into every bag: static transforms and lenses."""
+    """Keeps what is sent once but belongs into every bag: static transforms, lenses, what a rig says of itself."""
 
     def __init__(self) -> None:
         self._static: deque[ReceivedMessage] = deque(maxlen=_KEPT_STATIC)
@@ -134,7 +138,7 @@ class OpeningMessages:
 
     def note(self, message: ReceivedMessage) -> None:
         """Keep it if it is of that kind."""
-        if message.message_type == CAMERA_INFO:
+        if message.message_type == CAMERA_INFO or message.topic == RIG_TOPIC:
             self._infos[message.topic] = message
             return
         is_static = message.message_type == TRANSFORMS and message.topic.endswith("/tf_static")
