@@ -49,8 +49,7 @@ class TopicWatch:
             last = self._times[-1] if self._times else None
             periods = [b - a for a, b in pairwise(self._times)]
         if self._is_sent_once and last is not None:
-            words = {"messages": str(self.messages)}
-            return NodeStatus(self.topic, StatusLevel.OK, "received", words)
+            return NodeStatus(self.topic, StatusLevel.OK, "received", {"messages": str(self.messages)})
         period = median(periods) if periods else 0.0
         if last is None or now_s - last > max(_SILENT_S, _SILENT_PERIODS * period):
             silence = "nothing yet" if last is None else f"silent for {now_s - last:.0f} s"
