@@ -14,11 +14,16 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
-from rigwake.errors import HostError
+from rigwake.errors import HostError, InputError
 from rigwake.readers.channels import Encoding
-from rigwake.readers.rig_description import RIG_TOPIC
-from rigwake.readers.ros_decoding import typestore
-from rigwake.ros.transport import CAMERA_INFO, TRANSFORMS, ReceivedMessage
+from rigwake.readers.rig_description import (
+    MAX_TEXT_BYTES,
+    RIG_TOPIC,
+    RigDescription,
+    description_of_text,
+)
+from rigwake.readers.ros_decoding import decode, typestore
+from rigwake.ros.transport import CAMERA_INFO, STRING, TRANSFORMS, ReceivedMessage
 
 _MOST_BYTES = 256 << 20  # that wait to be written
 _LEAST_FREE = 1 << 30  # on the disk
@@ -144,6 +149,16 @@ class OpeningMessages:
         is_static = message.message_type == TRANSFORMS and message.topic.endswith("/tf_static")
         if is_static and all(message.payload != known.payload for known in self._static):
             self._static.append(message)
+
+    def description(self) -> RigDescription:
+        """What the rig says of itself, if it does."""
+        message = self._infos.get(RIG_TOPIC)
+        try:
+            if message is not None and len(message.payload) <= MAX_TEXT_BYTES:
+                return description_of_text(decode(message.payload, STRING, message.encoding).data)
+        except InputError:
+            return RigDescription()  # a calibration of the bag says what is wrong with it
+        return RigDescription()
 
     def messages(self) -> list[ReceivedMessage]:
         """All that are kept."""

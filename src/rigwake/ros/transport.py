@@ -80,5 +80,8 @@ class Transport(Protocol):
     def publish_jpeg(self, name: str, timestamp_ns: int, frame_id: str, jpeg: bytes) -> None:
         """A compressed image on `~name/compressed`."""
 
+    def listeners(self, name: str) -> int:
+        """How many receive `~name/compressed` now: nobody draws a picture that nobody looks at."""
+
     def close(self) -> None:
         """Leave the graph."""
