@@ -4,7 +4,7 @@ python benchmarks/fleet.py overhead   # ms per task of null work: local pool, Da
 python benchmarks/fleet.py growth     # tracks-only rigs per worker and CPU-second, from 1 worker to all cores
 python benchmarks/fleet.py many       # 100 000 null tasks through a Dask scheduler: memory of the client
 python benchmarks/fleet.py again      # a second run over 200 finished recordings
-python benchmarks/fleet.py losses     # 200 recordings on 3 workers; one killed with -9, one recording dies, one hangs
+python benchmarks/fleet.py losses     # 200 on 3 workers: a worker and the client are killed; one dies, one hangs
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from __future__ import annotations
 import os
 import resource
 import signal
+import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -22,9 +22,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
+from dask_cluster import PATHS, loopback_cluster, worker_pids
 from rigwake.fleet.dask_run import DaskRunner, dask_client
 from rigwake.fleet.fleet_jobs import FleetJob, FleetOutcome
-from rigwake.fleet.fleet_run import FleetPlan, counts_in_words, run_fleet
+from rigwake.fleet.fleet_run import FleetPlan, run_fleet
 from rigwake.fleet.run_jobs import FleetRunner, local_pool, run_jobs
 
 NULL, RIG, BY_NAME = "fleet_work:null_work", "fleet_work:rig_work", "fleet_work:work_by_name"
@@ -124,27 +125,48 @@ def again(out: str) -> None:
     )
 
 
+CLIENT = """
+import sys
+from pathlib import Path
+from rigwake.fleet.fleet_jobs import FleetJob
+from rigwake.fleet.fleet_run import FleetPlan, counts_in_words, run_fleet
+folder, address = Path(sys.argv[1]), sys.argv[2]
+paths = sorted(folder.glob("*.bag"))
+jobs = [FleetJob(str(p), str(folder / "out"), work="fleet_work:work_by_name", timeout_s=20.0) for p in paths]
+result = run_fleet(jobs, FleetPlan(folder / "out", address))
+print(counts_in_words(result.counts, result.causes), "| done before the restart:", result.done_before)
+"""
+
+
 def losses(out: str) -> None:
+    """Three real workers; one is killed with -9, later the client is as well, and started again."""
     folder = Path(out)
-    fleet = written_jobs(folder, ["die", "hang", *(f"slow{k}" for k in range(198))])
-    fleet = [FleetJob(j.recording, j.out, work=j.work, timeout_s=20.0) for j in fleet]
-    with dask_client("local:3") as client:
-        address = client.scheduler.address
-        noted = folder / "out" / "begun.txt"
+    written_jobs(folder, ["die", "hang", *(f"slow{k}" for k in range(198))])
+    noted = folder / "out" / "begun.txt"
 
-        def kill() -> None:
-            while not noted.exists() or len(noted.read_text().split()) < 60:
-                time.sleep(0.05)
-            os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
+    def wait_for(count: int) -> None:
+        while not noted.exists() or len(noted.read_text().split()) < count:
+            time.sleep(0.05)
 
-        threading.Thread(target=kill, daemon=True).start()
+    with loopback_cluster(folder, 3) as address:
+        words = [sys.executable, "-c", CLIENT, str(folder), address]
+        environment = {**os.environ, "PYTHONPATH": PATHS}
         begun = time.perf_counter()
-        result = run_fleet(fleet, FleetPlan(folder / "out", address))
+        client = subprocess.Popen(words, env=environment)
+        wait_for(60)
+        os.kill(worker_pids(address)[0], signal.SIGKILL)
+        wait_for(110)
+        client.kill()
+        client.wait()
+        print("a worker and the client were killed; the client is started again", flush=True)
+        subprocess.run(words, env=environment, check=True)
         wall = time.perf_counter() - begun
-        rows = result.tables.csv.read_text().splitlines()[1:]
+        rows = (folder / "out" / "fleet.csv").read_text().splitlines()[1:]
         names = Counter(row.split(",")[0] for row in rows)
-        print(f"{counts_in_words(result.counts, result.causes)} in {wall:.0f} s")
-        print(f"{len(rows)} rows, most of one recording: {max(names.values())}")
+        print(f"{len(rows)} rows, most of one recording: {max(names.values())}; {wall:.0f} s in all")
+        begun = time.perf_counter()
+        subprocess.run(words, env=environment, check=True)
+        print(f"once more, nothing to do: {time.perf_counter() - begun:.1f} s with the start of the program")
 
 
 def written_jobs(folder: Path, names: Sequence[str]) -> list[FleetJob]:

@@ -231,7 +231,7 @@ USED = [
     ),
     (
         "ros node --out {here}/r1 --calibration {calibration} --topic /imu --child-frame cam_{{name}} "
-        "--monitor-seconds 30 --record __name:=x",
+        "--monitor-seconds 30 --surround-hz 2 --ros 1 --record __name:=x",
         1,
         "ROS",
     ),

@@ -214,6 +214,9 @@ WRONG = [
     ("ros node --calibration {nowhere}", 1, "There is no file"),
     ("ros node --child-frame cam -o {here}/new", 2, "names all cameras alike."),
     ("ros node --monitor-seconds -1 -o {here}/new", 2, "a number above"),
+    ("ros node --surround-hz -1 -o {here}/new", 2, "a number above"),
+    ("ros node --ros 3 -o {here}/new", 2, "is no version of ROS."),
+    ("ros node --ros 2 -o {here}/new", 1, "ROS 2 is not usable here"),
     ("demo -o {text}", 2, "is a file, a folder is wanted."),
 ]
 

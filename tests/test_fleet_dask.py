@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -16,6 +15,7 @@ from pathlib import Path
 import pytest
 
 import rigwake
+from dask_cluster import PATHS, free_port, loopback_cluster, worker_pids
 from rigwake.errors import HostError, UsageError
 from rigwake.fleet.dask_run import check_workers, dask_client
 from rigwake.fleet.fleet_run import FleetPlan, run_fleet
@@ -24,66 +24,13 @@ from test_fleet_pool import begun, jobs_named
 
 distributed = pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
 pytestmark = [pytest.mark.xdist_group("fleet"), pytest.mark.filterwarnings("default")]
-PATHS = os.pathsep.join([str(Path(rigwake.__file__).parent.parent), str(Path(__file__).parent)])
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The address of a scheduler with three workers, in processes of their own as a cluster has them."""
-    folder = tmp_path_factory.mktemp("dask")
-    address = f"tcp://127.0.0.1:{free_port()}"
-    environment = {**os.environ, "PYTHONPATH": PATHS, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
-    environment["DASK_DISTRIBUTED__SCHEDULER__DASHBOARD__STATUS__TASK_STREAM_LENGTH"] = "10"
-    cli = [sys.executable, "-m", "distributed.cli"]
-    with (folder / "log.txt").open("w") as log:
-        common = {"stdout": log, "stderr": log, "env": environment, "cwd": folder, "start_new_session": True}
-        scheduler = subprocess.Popen(
-            [
-                *cli[:2],
-                "distributed.cli.dask_scheduler",
-                "--host",
-                "127.0.0.1",
-                "--port",
-                address.rpartition(":")[2],
-                "--no-dashboard",
-            ],
-            **common,  # type: ignore[call-overload]
-        )
-        worker = subprocess.Popen(
-            [
-                *cli[:2],
-                "distributed.cli.dask_worker",
-                address,
-                "--nworkers",
-                "3",
-                "--nthreads",
-                "1",
-                "--no-dashboard",
-                "--memory-limit",
-                "0",
-                "--local-directory",
-                str(folder),
-            ],
-            **common,  # type: ignore[call-overload]
-        )
-        try:
-            yield address
-        finally:
-            for process in (worker, scheduler):
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
-
-
-def worker_pids(address: str) -> list[int]:
-    with dask_client(address) as client:
-        client.wait_for_workers(1, timeout=60)
-        return list(client.run(os.getpid).values())
+    """The address of a scheduler with three workers."""
+    with loopback_cluster(tmp_path_factory.mktemp("dask")) as address:
+        yield address
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from rigwake.config import load_config
 from rigwake.geometry import so3
 from rigwake.pipeline.calibration_run import calibrate
 from rigwake.readers.open import open_recording
+from rigwake.recording import Recording
 from rigwake.tracks import load_tracks
 from rigwake.writers.write import write_recording
 from ros_graph import PLAYER, RosGraph, missing
@@ -60,7 +61,7 @@ def test_played_recorded_calibrated_published(graph: RosGraph, bag: Path, tmp_pa
     """What comes through ROS calibrates as the file does: the same tracks to the bit, the same rig; tf2 finds it."""
     graph.start_node("--out", tmp_path / "out")
     assert graph.look("record", "on")[0]
-    player = graph.play(bag, "--delay=4", "--rate=2")
+    player = graph.play(bag, "--wait-for-subscribers", "--delay=1", "--rate=2")
     player.wait(120)
     time.sleep(1.0)
     seen = graph.look("diagnostics")
@@ -76,6 +77,8 @@ def test_played_recorded_calibrated_published(graph: RosGraph, bag: Path, tmp_pa
     until(
         lambda: graph.look("diagnostics")["calibration"], lambda s: "on /tf_static" in s[1] or s[0] == 2, 180
     )
+    (recorded,) = (tmp_path / "out").glob("*.bag")
+    assert_same_recording(open_recording(recorded), open_recording(bag))
     (result,) = (tmp_path / "out").glob("*_calibration")
     found = load_calibration(result / "calibration.yaml")
     offline = calibrate(bag, tmp_path / "offline", load_config(jobs=1)).calibration
@@ -90,6 +93,18 @@ def test_played_recorded_calibrated_published(graph: RosGraph, bag: Path, tmp_pa
         np.testing.assert_allclose(
             so3.matrix_from_quat_wxyz(np.array(quat)), camera.rig_from_cam.rotation, atol=1e-6
         )
+
+
+def assert_same_recording(ours: Recording, theirs: Recording) -> None:
+    """Every sensor as the file has it: lenses to how far they reach, stamps, samples, noise."""
+    for name, camera in theirs.cameras.items():
+        np.testing.assert_array_equal(ours.cameras[name].timestamps_ns, camera.timestamps_ns)
+        assert ours.cameras[name].model == camera.model
+    for name, imu in theirs.imus.items():
+        np.testing.assert_array_equal(ours.imus[name].timestamps_ns, imu.timestamps_ns)
+        assert ours.imus[name].gyro_noise_density == imu.gyro_noise_density
+    for name, fixes in theirs.gnss.items():
+        np.testing.assert_array_equal(ours.gnss[name].position_enu, fixes.position_enu)
 
 
 def test_survives_a_master_restart_and_a_camera_that_dies_and_returns(

@@ -7,7 +7,6 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,8 +72,7 @@ def test_what_is_recorded_is_what_was_played_to_the_byte(
     for name, camera in played.cameras.items():
         again = recorded.cameras[name]
         np.testing.assert_array_equal(again.timestamps_ns, camera.timestamps_ns)
-        # how far the lens reaches stands in no ROS message
-        assert replace(again.model, angle_limit=None) == replace(camera.model, angle_limit=None)
+        assert again.model == camera.model
         for ours, theirs in zip(again.frames(), camera.frames(), strict=True):
             np.testing.assert_array_equal(ours.image, theirs.image)
     (imu,), (true,) = recorded.imus.values(), played.imus.values()

@@ -36,6 +36,7 @@ class CalibrateConfig(BaseModel):
 
     reference: `imu`, `base_link`, a camera's name, or `auto` (the IMU, else the reference camera).
     cameras: which to calibrate (all by default). start_s, duration_s: the part of the recording to use.
+    stretch_s: track in stretches of so many seconds, which a cluster works on side by side (whole by default).
     jobs: processes (0: as many as there are cores). seed: of everything random.
     time_offsets: estimate the cameras' clocks. imu, gnss: whether to use them.
     sensor_checks: compare every sensor with the others; repair: correct units, leave out samples that cannot be right.
@@ -49,6 +50,7 @@ class CalibrateConfig(BaseModel):
     cameras: tuple[str, ...] = ()
     start_s: float = Field(default=0.0, ge=0, allow_inf_nan=False)
     duration_s: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    stretch_s: float | None = Field(default=None, ge=20, allow_inf_nan=False)
     min_duration_s: float = Field(default=15.0, gt=0, allow_inf_nan=False)
     jobs: int = Field(default=0, ge=0)
     seed: int = 0

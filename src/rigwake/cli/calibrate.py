@@ -124,8 +124,8 @@ def command(
     known = None if prior is None else load_prior(prior)
     with progress_bars() as bars:
         run = calibrate(
-            recording,
-            out_folder,
+            recording.absolute() if scheduler else recording,  # the same place on every machine
+            out_folder.absolute() if scheduler else out_folder,
             settings,
             topics=TopicMap.from_options(topic or (), topics, camera_file or ()),
             trajectories=trajectories,

@@ -9,9 +9,12 @@ import json
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 from rich.markup import escape
@@ -35,52 +38,73 @@ if TYPE_CHECKING:
 
 _GIB = 2**30
 
-RecordingsArgument = Annotated[
-    list[str],
-    typer.Argument(help="Recordings, folders, patterns in quotes, or a text file: PATH[,VESSEL] per line."),
-]
-OutOption = Annotated[
-    Path, typer.Option("-o", "--out", help="Folder for results and tables, shared by all machines.")
-]
-SchedulerOption = Annotated[
-    str, typer.Option(help="Dask cluster: tcp://HOST:PORT, or local:N workers (extra `fleet`).")
-]
-JobsOption = Annotated[int, typer.Option(min=0, help="Processes on this machine (0: one per core).")]
-TimeoutOption = Annotated[float, typer.Option(help="Seconds after which a recording is given up.")]
-MemoryOption = Annotated[float | None, typer.Option(help="GiB that one recording may take (default: any).")]
-RetriesOption = Annotated[
-    int, typer.Option(min=0, max=10, help="How often a recording whose worker was lost is tried again.")
-]
-ShardOption = Annotated[
-    str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts, for job arrays: 1/8 .. 8/8.")
-]
-RetryFailedOption = Annotated[
-    bool, typer.Option("--retry-failed", help="Try again what failed in a former run.")
-]
-VesselOption = Annotated[
-    str, typer.Option(help="Whose recordings they are (default: by the list, else by the folder's name).")
-]
+
+@dataclass(frozen=True)
+class FleetChoices:
+    """What every verb over a fleet lets one choose. Each field is an option (or argument) of the command line."""
+
+    recordings: Annotated[
+        list[str],
+        typer.Argument(
+            help="Recordings, folders, patterns in quotes, or a text file: PATH[,VESSEL] per line."
+        ),
+    ]
+    out_folder: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder for results and tables, shared by all machines.")
+    ]
+    scheduler: Annotated[
+        str, typer.Option(help="Dask cluster: tcp://HOST:PORT, or local:N workers (extra `fleet`).")
+    ] = ""
+    jobs: Annotated[int, typer.Option(min=0, help="Processes on this machine (0: one per core).")] = 0
+    timeout: Annotated[float, typer.Option(help="Seconds after which a recording is given up.")] = 3600.0
+    memory: Annotated[float | None, typer.Option(help="GiB that one recording may take (default: any).")] = (
+        None
+    )
+    retries: Annotated[
+        int, typer.Option(min=0, max=10, help="How often a recording whose worker was lost is tried again.")
+    ] = 1
+    shard: Annotated[
+        str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts, for job arrays: 1/8 .. 8/8.")
+    ] = None
+    retry_failed: Annotated[
+        bool, typer.Option("--retry-failed", help="Try again what failed in a former run.")
+    ] = False
+    vessel: Annotated[
+        str, typer.Option(help="Whose recordings they are (default: by the list, else by the folder's name).")
+    ] = ""
+    topic: TopicOption = None
+    topics: TopicsOption = None
+    allow_partial: AllowPartialOption = False
+    json_file: JsonOption = None
 
 
+def _with_fleet_choices(verb: Callable[..., None]) -> Callable[..., None]:
+    """A command with the options of `verb` and those of `FleetChoices`, which `verb` takes as its first argument."""
+    shared = get_type_hints(FleetChoices, include_extras=True)
+    own = get_type_hints(verb, include_extras=True)
+    given = [*signature(FleetChoices).parameters.values(), *list(signature(verb).parameters.values())[1:]]
+    hints = {**shared, **{name: hint for name, hint in own.items() if name not in ("choices", "return")}}
+
+    @wraps(verb)
+    def command(**values: Any) -> None:
+        mine = {name: values.pop(name) for name in list(values) if name not in shared}
+        verb(FleetChoices(**values), **mine)
+
+    keyword = Parameter.KEYWORD_ONLY
+    command.__signature__ = Signature(  # type: ignore[attr-defined]
+        [p.replace(kind=keyword, annotation=hints[p.name]) for p in given]
+    )
+    command.__annotations__ = hints
+    return command
+
+
+@_with_fleet_choices
 def calibrate(
-    recordings: RecordingsArgument,
-    out_folder: OutOption,
+    choices: FleetChoices,
     config: Annotated[Path | None, typer.Option(help="YAML file of settings, as for `calibrate`.")] = None,
     assignments: Annotated[
         list[str] | None, typer.Option("--set", help="One setting: adjustment.cross_camera=false.")
     ] = None,
-    scheduler: SchedulerOption = "",
-    jobs: JobsOption = 0,
-    timeout: TimeoutOption = 3600.0,
-    memory: MemoryOption = None,
-    retries: RetriesOption = 1,
-    shard: ShardOption = None,
-    retry_failed: RetryFailedOption = False,
-    vessel: VesselOption = "",
-    topic: TopicOption = None,
-    topics: TopicsOption = None,
-    allow_partial: AllowPartialOption = False,
-    json_file: JsonOption = None,
 ) -> None:
     """Calibrate many recordings, each once. A second run does only what is new or changed.
 
@@ -88,68 +112,50 @@ def calibrate(
 
     Example: [cyan]rigwake fleet calibrate list.csv --out /shared/OUT --scheduler tcp://head:8786[/cyan]
     """
-    require_there(config, topics)
-    plan = _plan(out_folder, scheduler, jobs, retries, shard, retry_failed, timeout, memory, json_file)
+    require_there(config, choices.topics)
+    plan = _plan(choices)
     from rigwake.config import load_config
 
     settings = load_config(config, assignments or ()).model_dump(mode="json")
-    values: dict[str, Any] = {"verb": "calibrate", "settings": json.dumps(settings, sort_keys=True)}
-    _run(recordings, vessel, plan, timeout, memory, topic, topics, values, allow_partial, json_file)
+    _run(choices, plan, {"verb": "calibrate", "settings": json.dumps(settings, sort_keys=True)})
 
 
+@_with_fleet_choices
 def monitor(
-    recordings: RecordingsArgument,
-    out_folder: OutOption,
+    choices: FleetChoices,
     calibration: Annotated[
         Path, typer.Option(help="calibration.yaml of all, or a folder with VESSEL.yaml for each vessel.")
     ],
-    scheduler: SchedulerOption = "",
-    jobs: JobsOption = 0,
-    timeout: TimeoutOption = 3600.0,
-    memory: MemoryOption = None,
-    retries: RetriesOption = 1,
-    shard: ShardOption = None,
-    retry_failed: RetryFailedOption = False,
-    vessel: VesselOption = "",
-    topic: TopicOption = None,
-    topics: TopicsOption = None,
-    allow_partial: AllowPartialOption = False,
-    json_file: JsonOption = None,
 ) -> None:
     """Has a camera moved in any of many recordings? Each is compared with the calibration of its vessel.
 
     Example: [cyan]rigwake fleet monitor list.csv --calibration calibrations/ --out OUT[/cyan]
     """
-    require_there(calibration, topics)
-    plan = _plan(out_folder, scheduler, jobs, retries, shard, retry_failed, timeout, memory, json_file)
-    values: dict[str, Any] = {"verb": "monitor", "calibration": str(calibration.absolute())}
-    _run(recordings, vessel, plan, timeout, memory, topic, topics, values, allow_partial, json_file)
+    require_there(calibration, choices.topics)
+    _run(choices, _plan(choices), {"verb": "monitor", "calibration": str(calibration.absolute())})
 
 
 COMMANDS = {"calibrate": calibrate, "monitor": monitor}
 
 
-def _plan(
-    out_folder: Path,
-    scheduler: str,
-    jobs: int,
-    retries: int,
-    shard: str | None,
-    retry_failed: bool,
-    timeout: float,
-    memory: float | None,
-    json_file: Path | None,
-) -> FleetPlan:
+def _plan(choices: FleetChoices) -> FleetPlan:
     """What was asked for, checked before what computes is imported."""
-    require_writable("--out", out_folder, folder=True)
-    require_writable("--json", json_file)
-    require_number("--timeout", timeout, above=0)
-    require_number("--memory", memory, above=0)
-    part = _shard(shard)
-    require_scheduler(scheduler)
+    require_writable("--out", choices.out_folder, folder=True)
+    require_writable("--json", choices.json_file)
+    require_number("--timeout", choices.timeout, above=0)
+    require_number("--memory", choices.memory, above=0)
+    part = _shard(choices.shard)
+    require_scheduler(choices.scheduler)
     from rigwake.fleet.fleet_run import FleetPlan
 
-    return FleetPlan(out_folder, scheduler, jobs or os.cpu_count() or 1, retries, part, retry_failed)
+    return FleetPlan(
+        choices.out_folder,
+        choices.scheduler,
+        choices.jobs or os.cpu_count() or 1,
+        choices.retries,
+        part,
+        choices.retry_failed,
+    )
 
 
 def _shard(text: str | None) -> tuple[int, int] | None:
@@ -164,28 +170,17 @@ def _shard(text: str | None) -> tuple[int, int] | None:
     return index, count
 
 
-def _run(
-    recordings: Sequence[str],
-    vessel: str,
-    plan: FleetPlan,
-    timeout: float,
-    memory: float | None,
-    topic: list[str] | None,
-    topics: Path | None,
-    values: dict[str, Any],
-    allow_partial: bool,
-    json_file: Path | None,
-) -> None:
+def _run(choices: FleetChoices, plan: FleetPlan, values: dict[str, Any]) -> None:
     from rigwake.fleet.fleet_jobs import FleetJob
     from rigwake.fleet.fleet_run import run_fleet
     from rigwake.fleet.recording_list import list_recordings
     from rigwake.readers.topics import TopicMap
 
-    chosen = TopicMap.from_options(topic or (), topics)
-    listed, again = list_recordings(recordings, vessel, plan.out)
+    chosen = TopicMap.from_options(choices.topic or (), choices.topics)
+    listed, again = list_recordings(choices.recordings, choices.vessel, plan.out)
     values["topics"] = json.dumps({role: dict(names) for role, names in chosen.roles.items()}, sort_keys=True)
-    values["timeout_s"] = timeout
-    values["memory_bytes"] = None if memory is None else math.ceil(memory * _GIB)
+    values["timeout_s"] = choices.timeout
+    values["memory_bytes"] = None if choices.memory is None else math.ceil(choices.memory * _GIB)
     own = _calibrations(listed, values.pop("calibration", None))
     none: dict[str, Any] = {}
     fleet = [
@@ -203,11 +198,11 @@ def _run(
                 task, description=f"fleet: {words}", completed=done, total=total
             ),
         )
-    if json_file is not None:
-        write_json(json_file, _as_dict(result))
-    if str(json_file) != "-":
+    if choices.json_file is not None:
+        write_json(choices.json_file, _as_dict(result))
+    if str(choices.json_file) != "-":
         _print_result(result)
-    _end(result, allow_partial)
+    _end(result, choices.allow_partial)
 
 
 def _calibrations(listed: Sequence[ListedRecording], path: str | None) -> dict[str, dict[str, Any]]:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import queue
+import secrets
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from rigwake import __version__
+from rigwake.atomic import write_text_atomic
 from rigwake.errors import HostError, UsageError
 from rigwake.fleet.fleet_jobs import KILLED, FleetJob, FleetOutcome, failure
 from rigwake.fleet.task_process import TaskProcess
@@ -182,7 +185,7 @@ def scheduler_lost() -> HostError:
 
 
 def cameras_on_cluster(scheduler: str) -> Callable[..., list[Any]]:
-    """In place of `process_cameras`: the cameras of one recording as tasks of a cluster.
+    """In place of `process_cameras`: the cameras of one recording as tasks of a cluster, one per camera and stretch.
 
     The folder of the result must be shared; streams travel as paths and read their images where they are worked on.
     """
@@ -193,16 +196,17 @@ def cameras_on_cluster(scheduler: str) -> Callable[..., list[Any]]:
         progress: Callable[[str, str, float], None],
         finished: Callable[[Any], None] = lambda outcome: None,
     ) -> list[Any]:
-        from distributed import as_completed
+        from distributed import CancelledError, as_completed
         from distributed.scheduler import KilledWorker
 
-        from rigwake.pipeline.camera_stage import process_camera
-
         with dask_client(scheduler) as client:
-            futures = {client.submit(_camera, process_camera, job, pure=False): job for job in jobs}
+            _check_shared(DaskRunner(client), jobs[0].out.resolve())
+            futures = {client.submit(_camera, job, pure=False): job.stream.name for job in jobs}
+            for name in futures.values():
+                progress(name, "on the cluster", 0.0)
             outcomes = {}
             for future in as_completed(futures):
-                name = futures[future].stream.name
+                name = futures[future]
                 try:
                     outcomes[name] = future.result()
                 except KilledWorker as error:
@@ -211,6 +215,8 @@ def cameras_on_cluster(scheduler: str) -> Callable[..., list[Any]]:
                         consequence="What was finished before is kept.",
                         remedy="Start the workers again, with more memory, and run again with --resume.",
                     ) from error
+                except CancelledError as error:
+                    raise scheduler_lost() from error
                 progress(name, "done", 1.0)
                 finished(outcomes[name])
         return [outcomes[job.stream.name] for job in jobs]
@@ -218,8 +224,30 @@ def cameras_on_cluster(scheduler: str) -> Callable[..., list[Any]]:
     return run
 
 
-def _camera(work: Callable[..., Any], job: Any) -> Any:
-    return work(job, _no_progress)
+def _check_shared(runner: DaskRunner, out: Path) -> None:
+    """Raises HostError where a worker is of another version or sees another folder."""
+    file, token = out / f".cluster-{os.getpid()}", secrets.token_hex(16)
+    write_text_atomic(file, token)
+    try:
+        runner.check(out, file.name, token)
+    finally:
+        file.unlink(missing_ok=True)
+
+
+def _camera(job: Any) -> Any:
+    """Runs on a worker: one camera, its stretches as tasks of their own."""
+    from rigwake.pipeline.camera_stage import process_camera
+
+    return process_camera(job, _no_progress, _stretches_on_cluster)
+
+
+def _stretches_on_cluster(work: Callable[[Any], Any], stretches: Sequence[Any]) -> list[Any]:
+    if len(stretches) == 1:
+        return [work(stretches[0])]
+    from distributed import worker_client
+
+    with worker_client() as client:  # this task waits, and lets the worker do others meanwhile
+        return list(client.gather(client.map(work, stretches, pure=False)))
 
 
 def _no_progress(*_: Any) -> None:

@@ -47,11 +47,13 @@ def measure_camera(
     horizon: HorizonChoice = "auto",
     mask_file: Path | None = None,
     turns: Trajectory | None = None,
+    track: Callable[..., Tracks] = track_camera,
 ) -> CameraMeasurement:
     """Mask, gyro and tracks of a camera; the gyro tells where the horizon is, and below it nothing is tracked.
 
     hull: look for the own boat in view. horizon: leave out what lies below it (auto: where it is water). mask_file: a
     picture of the camera's size, white where it may be used. turns: what `visual_rotations` finds, if that is known.
+    track: `track_camera`, or what does the same in parts.
     A hull that is not found and a gyro that does not fit are noted and done without. Raises EstimationError where
     nothing can be tracked.
     """
@@ -74,7 +76,7 @@ def measure_camera(
             notes.append(below.words)
             up_cam = None if below.is_rigid else up_cam
     total = max(len(stream), 1)
-    tracks = track_camera(
+    tracks = track(
         stream, tracking, mask, up_cam=up_cam, progress=lambda done: progress("tracking", done, total)
     )
     marks.append(time.perf_counter())

@@ -6,6 +6,7 @@ import json
 import time
 import traceback
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,9 @@ from rigwake.odometry.bridged import frames_not_tracked
 from rigwake.odometry.measure import measure_camera
 from rigwake.odometry.monocular import estimate_monocular
 from rigwake.recording import CameraStream, ImuStream
+from rigwake.tracking.front_ends import track_camera
 from rigwake.tracking.hull_picture import save_hull_picture
+from rigwake.tracking.stretches import MapStretches, track_in_stretches
 from rigwake.trajectory import Trajectory
 from rigwake.writers.trajectory_writer import write_tum
 
@@ -87,18 +90,23 @@ def load_outcome(out: Path, camera: str) -> CameraOutcome:
         ) from error
 
 
-def process_camera(job: CameraJob, report_stage: StageProgress) -> CameraOutcome:
-    """Mask, turns, tracks and odometry of one camera; a camera that fails is an outcome, not an exception."""
+def process_camera(
+    job: CameraJob, report_stage: StageProgress, map_stretches: MapStretches = map
+) -> CameraOutcome:
+    """Mask, turns, tracks and odometry of one camera; a camera that fails is an outcome, not an exception.
+
+    map_stretches: where the stretches of a long recording are tracked, by default here.
+    """
     cv2.setNumThreads(1)
     started, name = time.perf_counter(), job.stream.name
     try:
-        outcome = _process(job, report_stage)
+        outcome = _process(job, report_stage, map_stretches)
     except HostError:
         raise  # not the camera's fault: all stop
     except RigwakeError as error:
         outcome = CameraOutcome(name, str(error), unobservable=error.exit_code == 3)
         if job.imu is not None and job.config.sensor_checks:
-            outcome = _once_more(job, report_stage, outcome)
+            outcome = _once_more(job, report_stage, map_stretches, outcome)
     except (ArithmeticError, IndexError, ValueError, np.linalg.LinAlgError) as error:
         # a fault of the program on this camera's data: the others are calibrated all the same
         where = traceback.extract_tb(error.__traceback__)[-1]
@@ -111,15 +119,19 @@ def process_camera(job: CameraJob, report_stage: StageProgress) -> CameraOutcome
     return outcome
 
 
-def _once_more(job: CameraJob, report_stage: StageProgress, failed: CameraOutcome) -> CameraOutcome:
+def _once_more(
+    job: CameraJob, report_stage: StageProgress, map_stretches: MapStretches, failed: CameraOutcome
+) -> CameraOutcome:
     """What the images show without the IMU's horizon, which mirrored pictures put the wrong way up."""
     try:
-        return replace(_process(job, report_stage, horizon=False), without_horizon=True)
+        return replace(_process(job, report_stage, map_stretches, horizon=False), without_horizon=True)
     except RigwakeError:
         return failed
 
 
-def _process(job: CameraJob, report_stage: StageProgress, *, horizon: bool = True) -> CameraOutcome:
+def _process(
+    job: CameraJob, report_stage: StageProgress, map_stretches: MapStretches, *, horizon: bool = True
+) -> CameraOutcome:
     stream, config = job.stream, job.config
     assert stream.model is not None
 
@@ -134,6 +146,9 @@ def _process(job: CameraJob, report_stage: StageProgress, *, horizon: bool = Tru
         hull=config.find_self_mask,
         horizon=config.horizon if horizon else "off",
         turns=job.turns,
+        track=track_camera
+        if config.stretch_s is None
+        else partial(track_in_stretches, stretch_s=config.stretch_s, map_stretches=map_stretches),
     )
     measured.mask.save(job.out / "masks", stream.name)
     if measured.mask.excluded.get("hull", np.zeros(1, dtype=bool)).any():

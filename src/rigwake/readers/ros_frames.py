@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rigwake._types import Image, Stamps
 from rigwake.errors import InputError
-from rigwake.readers.channels import Channel
+from rigwake.readers.channels import Channel, Encoding
 from rigwake.readers.images import (
     ImageSize,
     checked_size,
@@ -54,7 +54,10 @@ class RosFrames:
         payloads = self.channel.payloads.read(self.rows[wanted])
         for index, payload in zip(wanted, payloads, strict=True):
             try:
-                image = decode_image(payload, self.channel, colour=colour, used_bits=self.used_bits)
+                channel = self.channel
+                image = image_of_message(
+                    payload, channel.message_type, channel.encoding, colour=colour, used_bits=self.used_bits
+                )
             except InputError:
                 continue
             if image.shape[:2] == (self.size.height_px, self.size.width_px):
@@ -80,10 +83,12 @@ class RosFrames:
             yield int(index), encoded
 
 
-def decode_image(payload: bytes, channel: Channel, *, colour: bool, used_bits: int | None = None) -> Image:
+def image_of_message(
+    payload: bytes, message_type: str, encoding: Encoding, *, colour: bool, used_bits: int | None = None
+) -> Image:
     """The image of a sensor_msgs Image or CompressedImage; InputError if it is damaged or too large."""
-    message = decode(payload, channel.message_type, channel.encoding)
-    if channel.message_type == COMPRESSED or message.encoding.lower() in _ENCODED:
+    message = decode(payload, message_type, encoding)
+    if message_type == COMPRESSED or message.encoding.lower() in _ENCODED:
         return decode_compressed(message.data.tobytes(), colour=colour, used_bits=used_bits)
     return decode_raw(
         message.data,
@@ -108,7 +113,7 @@ class ImageFormat(NamedTuple):
 
 
 def image_format(payload: bytes, channel: Channel) -> ImageFormat:
-    """Size and encoding of the image in a message, without decoding pixels; InputError as `decode_image`."""
+    """Size and encoding of the image in a message, without decoding pixels; InputError as `image_of_message`."""
     message = decode(payload, channel.message_type, channel.encoding)
     if channel.message_type == COMPRESSED:
         # image_transport writes `bgr8; jpeg compressed bgr8`, `16UC1; compressedDepth`; others `jpeg`, `png`

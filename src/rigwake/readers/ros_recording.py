@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -47,6 +47,11 @@ from rigwake.trajectory import Trajectory
 _STRING = "std_msgs/msg/String"
 _ROLE_TYPES = {"camera": IMAGE_TYPES, "imu": {IMU}, "gnss": {FIX}, "pose": POSE_TYPES}
 _UNDERSTOOD = frozenset().union(*_ROLE_TYPES.values(), {INFO}, TF_TYPES, VELOCITY_TYPES)
+
+
+def is_read(topic: str, message_type: str) -> bool:
+    """Whether `recording_from_bag` makes anything of such a topic; message_type: `package/msg/Name`."""
+    return message_type in _UNDERSTOOD or (topic == RIG_TOPIC and message_type == _STRING)
 
 
 @dataclass
@@ -200,6 +205,14 @@ def _limit_bytes(channel: Channel) -> int:
     return MAX_TF_BYTES if channel.message_type in TF_TYPES else MAX_SENSOR_BYTES
 
 
+def names_in_role(role: str, topics: Sequence[str], description: RigDescription) -> dict[str, str]:
+    """Names of sensors by topic: what the recording says of itself, else as recognised from the topics."""
+    given = sensor_names(topics, role)
+    if role == "imu":  # an attitude without rates travels as the same type
+        given = {topic: description.name_of("attitude", topic, name) for topic, name in given.items()}
+    return distinct_names({topic: description.name_of(role, topic, n) for topic, n in given.items()})
+
+
 def _channels_of(
     role: str, usable: Mapping[str, Channel], topics: TopicMap, description: RigDescription
 ) -> dict[str, Channel]:
@@ -207,10 +220,7 @@ def _channels_of(
     candidates = {topic: c for topic, c in usable.items() if c.message_type in types}
     chosen = topics.chosen(role)
     if chosen is None:
-        given = sensor_names(list(candidates), role)
-        if role == "imu":  # an attitude without rates travels as the same type
-            given = {topic: description.name_of("attitude", topic, name) for topic, name in given.items()}
-        names = distinct_names({topic: description.name_of(role, topic, n) for topic, n in given.items()})
+        names = names_in_role(role, list(candidates), description)
         return {names[topic]: channel for topic, channel in candidates.items()}
     missing = [topic for topic in chosen.values() if topic not in candidates]
     if missing:

@@ -11,20 +11,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rigwake.calibration import Calibration, load_calibration
 from rigwake.errors import HostError, RigwakeError
+from rigwake.readers.ros_frames import IMAGE_TYPES
+from rigwake.readers.ros_recording import is_read, names_in_role
 from rigwake.readers.topics import camera_base
 from rigwake.ros.child_command import ChildCommand
-from rigwake.ros.recorder import BagRecorder, OpeningMessages
+from rigwake.ros.recorder import BagRecorder, OpeningMessages, is_sent_once
 from rigwake.ros.topic_watch import TopicWatch
 from rigwake.ros.transport import (
     COMPRESSED_IMAGE,
     IMAGE,
-    SENSOR_TYPES,
+    STRING,
     TRANSFORMS,
     Answer,
     NodeStatus,
@@ -33,6 +35,10 @@ from rigwake.ros.transport import (
     Transport,
 )
 
+if TYPE_CHECKING:
+    from rigwake.ros.surround_stream import SurroundStream
+
+SURROUND = "surround"
 _JUMP_NS = 1_000_000_000  # the clock ran back: a new bag begins
 _DISCOVER_EVERY_S = 2.0
 _STATUS_EVERY_S = 1.0
@@ -43,6 +49,7 @@ _STATE_LEVELS = {"OK": StatusLevel.OK, "DRIFTED": StatusLevel.ERROR}
 class NodeOptions:
     """out: folder for bags and results. calibration: known at the start. topics: only these (all sensors by default).
     child_frame: name of a camera's frame. monitor_s: length of the pieces that the monitor judges (0: no monitor).
+    surround_hz: surround pictures per second at most, while somebody looks (0: never).
     program: the command that calibrates and monitors, `rigwake` of this interpreter by default. calibrate_words:
     further options of `rigwake calibrate`."""
 
@@ -51,6 +58,7 @@ class NodeOptions:
     topics: tuple[str, ...] = ()
     child_frame: str = "{name}_optical_frame"
     monitor_s: float = 0.0
+    surround_hz: float = 5.0
     least_free: int = 1 << 30
     program: tuple[str, ...] = ()
     calibrate_words: tuple[str, ...] = ()
@@ -63,6 +71,7 @@ class RigwakeNode:
         self._transport, self._options = transport, options
         self._lock = threading.RLock()
         self._watches: dict[str, TopicWatch] = {}
+        self._image_topics: list[str] = []
         self._opening = OpeningMessages()
         self._recorder: BagRecorder | None = None
         self._piece: BagRecorder | None = None  # what the monitor judges next
@@ -78,6 +87,7 @@ class RigwakeNode:
         self._recording_fault = ""
         self._jumps = 0
         self._discovered_s = self._told_s = float("-inf")
+        self._surround: SurroundStream | None = None  # begins with the first who looks
         if options.calibration is not None:
             self._take(options.calibration)
         transport.serve_switch("record", self.record)
@@ -95,13 +105,19 @@ class RigwakeNode:
             self._told_s = now
             self._transport.publish_status(self.statuses(now))
             self._advance_monitor(now)
+            self._look_for_viewers()
 
     def _discover(self) -> None:
         known = self._transport.topics()
+        own = f"{self._transport.own_name()}/{SURROUND}/compressed"
         for topic, message_type in chosen_topics(known, self._options.topics).items():
-            if topic not in self._watches:
-                is_stamped = message_type != TRANSFORMS
-                self._watches[topic] = TopicWatch(topic, is_stamped=is_stamped)
+            if topic not in self._watches and topic != own:
+                if message_type in IMAGE_TYPES:
+                    self._image_topics.append(topic)
+                is_stamped = message_type not in (TRANSFORMS, STRING)
+                self._watches[topic] = TopicWatch(
+                    topic, is_stamped=is_stamped, is_sent_once=is_sent_once(topic)
+                )
                 self._transport.subscribe(topic, message_type, self._received)
 
     def _received(self, message: ReceivedMessage) -> None:
@@ -116,6 +132,8 @@ class RigwakeNode:
             for recorder in (self._recorder, self._piece):
                 if recorder is not None:
                     recorder.add(message)
+        if self._surround is not None and message.message_type in IMAGE_TYPES:
+            self._surround.note(message)
 
     def _jumped(self) -> None:
         """The clock ran back, as when a bag is played again: two times must not stand in one bag."""
@@ -269,6 +287,30 @@ class RigwakeNode:
             with contextlib.suppress(HostError):
                 _remove(piece.close())
 
+    # the surround view
+
+    def _look_for_viewers(self) -> None:
+        if self._options.surround_hz <= 0:
+            return
+        wanted = self._transport.listeners(SURROUND) > 0
+        if self._surround is None:
+            if not wanted:
+                return
+            from rigwake.ros.surround_stream import SurroundStream  # views are loaded when they are wanted
+
+            self._surround = SurroundStream(
+                self._camera_names,
+                lambda *picture: self._transport.publish_jpeg(SURROUND, *picture),
+                self._options.surround_hz,
+            )
+            self._surround.start()
+        self._surround.want(wanted, self._calibration)
+
+    def _camera_names(self) -> dict[str, str]:
+        """By topic, as a bag of these topics would name them."""
+        with self._lock:
+            return names_in_role("camera", list(self._image_topics), self._opening.description())
+
     # what goes out
 
     def statuses(self, now_s: float) -> list[NodeStatus]:
@@ -280,6 +322,8 @@ class RigwakeNode:
                     "calibration", StatusLevel.OK, f"{said.message}: {self._calibrating.progress}"
                 )
             entries = [self._recording_status(), said, *self._cameras]
+            if self._surround is not None:
+                entries.append(self._surround.status)
         return [*entries, *(watch.status(now_s) for watch in list(self._watches.values()))]
 
     def _recording_status(self) -> NodeStatus:
@@ -303,6 +347,8 @@ class RigwakeNode:
         for child in (self._calibrating, self._monitoring):
             if child is not None:
                 child.end()
+        if self._surround is not None:
+            self._surround.stop()
         with self._lock:
             self._close_bag()
             self._drop_piece()
@@ -317,8 +363,9 @@ def _remove(bag: Path) -> None:
 
 
 def chosen_topics(known: dict[str, str], only: Sequence[str]) -> dict[str, str]:
-    """What is subscribed: sensors' topics; of a camera that is sent raw and compressed, the compressed one."""
-    sensors = {topic: kind for topic, kind in known.items() if kind in SENSOR_TYPES}
+    """What is subscribed: all that the readers understand, so that a bag of the node gives what the topics gave; of a
+    camera that is sent raw and compressed, the compressed one."""
+    sensors = {topic: kind for topic, kind in known.items() if is_read(topic, kind)}
     if only:
         return {topic: kind for topic, kind in sensors.items() if topic in only}
     packed = {camera_base(topic) for topic, kind in sensors.items() if kind == COMPRESSED_IMAGE}

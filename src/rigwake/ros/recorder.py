@@ -14,10 +14,16 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
-from rigwake.errors import HostError
+from rigwake.errors import HostError, InputError
 from rigwake.readers.channels import Encoding
-from rigwake.readers.ros_decoding import typestore
-from rigwake.ros.transport import CAMERA_INFO, TRANSFORMS, ReceivedMessage
+from rigwake.readers.rig_description import (
+    MAX_TEXT_BYTES,
+    RIG_TOPIC,
+    RigDescription,
+    description_of_text,
+)
+from rigwake.readers.ros_decoding import decode, typestore
+from rigwake.ros.transport import CAMERA_INFO, STRING, TRANSFORMS, ReceivedMessage
 
 _MOST_BYTES = 256 << 20  # that wait to be written
 _LEAST_FREE = 1 << 30  # on the disk
@@ -91,9 +97,7 @@ class BagRecorder:
 
     def _write(self, message: ReceivedMessage) -> None:
         if message.topic not in self._connections:
-            latched = (
-                {"latching": 1} if self._encoding == "ros1" and message.topic.endswith("/tf_static") else {}
-            )
+            latched = {"latching": 1} if self._encoding == "ros1" and is_sent_once(message.topic) else {}
             self._connections[message.topic] = self._writer.add_connection(
                 message.topic, message.message_type, typestore=typestore(self._encoding), **latched
             )
@@ -125,8 +129,13 @@ def _forget_written(writer: Any) -> None:
         chunk.connections = {number: range(len(places)) for number, places in chunk.connections.items()}
 
 
+def is_sent_once(topic: str) -> bool:
+    """Whether silence on this topic is as it should be: it is latched."""
+    return topic.endswith("/tf_static") or topic == RIG_TOPIC
+
+
 class OpeningMessages:
-    """Keeps what is sent once but belongs into every bag: static transforms and lenses."""
+    """Keeps what is sent once but belongs into every bag: static transforms, lenses, what a rig says of itself."""
 
     def __init__(self) -> None:
         self._static: deque[ReceivedMessage] = deque(maxlen=_KEPT_STATIC)
@@ -134,12 +143,22 @@ class OpeningMessages:
 
     def note(self, message: ReceivedMessage) -> None:
         """Keep it if it is of that kind."""
-        if message.message_type == CAMERA_INFO:
+        if message.message_type == CAMERA_INFO or message.topic == RIG_TOPIC:
             self._infos[message.topic] = message
             return
         is_static = message.message_type == TRANSFORMS and message.topic.endswith("/tf_static")
         if is_static and all(message.payload != known.payload for known in self._static):
             self._static.append(message)
+
+    def description(self) -> RigDescription:
+        """What the rig says of itself, if it does."""
+        message = self._infos.get(RIG_TOPIC)
+        try:
+            if message is not None and len(message.payload) <= MAX_TEXT_BYTES:
+                return description_of_text(decode(message.payload, STRING, message.encoding).data)
+        except InputError:
+            return RigDescription()  # a calibration of the bag says what is wrong with it
+        return RigDescription()
 
     def messages(self) -> list[ReceivedMessage]:
         """All that are kept."""

@@ -14,7 +14,8 @@ from rigwake.ros.transport import Answer, NodeStatus, ReceivedMessage
 class ReplayTransport:
     """Plays the channels of a bag in the order of their recording, as fast as the node takes them.
 
-    static, statuses, images: what the node has published. services: what it serves, by name.
+    static, statuses, images: what the node has published. services: what it serves, by name. listening: who receives
+    images, by the name of their topic.
     """
 
     def __init__(self, bag: BagIndex) -> None:
@@ -23,6 +24,7 @@ class ReplayTransport:
         self.statuses: list[NodeStatus] = []
         self.images: list[tuple[str, int, bytes]] = []
         self.services: dict[str, Callable[..., Answer]] = {}
+        self.listening: dict[str, int] = {}
         self._channels = {channel.topic: channel for channel in bag.channels}
         self._callbacks: dict[str, Callable[[ReceivedMessage], None]] = {}
 
@@ -67,6 +69,10 @@ class ReplayTransport:
     def publish_jpeg(self, name: str, timestamp_ns: int, frame_id: str, jpeg: bytes) -> None:
         """See `Transport.publish_jpeg`."""
         self.images.append((name, timestamp_ns, jpeg))
+
+    def listeners(self, name: str) -> int:
+        """See `Transport.listeners`."""
+        return self.listening.get(name, 0)
 
     def close(self) -> None:
         """See `Transport.close`."""

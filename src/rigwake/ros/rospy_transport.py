@@ -120,6 +120,12 @@ class RospyTransport:
         message.header.frame_id = frame_id
         self._publisher(f"~{name}/compressed", CompressedImage).publish(message)
 
+    def listeners(self, name: str) -> int:
+        """See `Transport.listeners`."""
+        from sensor_msgs.msg import CompressedImage
+
+        return int(self._publisher(f"~{name}/compressed", CompressedImage).get_num_connections())
+
     def _publisher(self, topic: str, kind: Any, *, latch: bool = False) -> Any:
         if topic not in self._publishers:
             self._publishers[topic] = self._rospy.Publisher(topic, kind, queue_size=2, latch=latch)

@@ -21,11 +21,11 @@ _BACK_NS = 1_000_000
 class TopicWatch:
     """Told every message of one topic; says how the topic does. Times are seconds of a steady clock."""
 
-    def __init__(self, topic: str, *, is_stamped: bool = True) -> None:
+    def __init__(self, topic: str, *, is_stamped: bool = True, is_sent_once: bool = False) -> None:
         self.topic = topic
         self.messages = 0
         self.backwards = 0
-        self._is_stamped = is_stamped
+        self._is_stamped, self._is_sent_once = is_stamped, is_sent_once
         self._last_stamp_ns: int | None = None
         self._times: deque[float] = deque(maxlen=_WINDOW)
         self._lock = threading.Lock()
@@ -48,6 +48,8 @@ class TopicWatch:
             times = [t for t in self._times if now_s - t <= _WINDOW_S]
             last = self._times[-1] if self._times else None
             periods = [b - a for a, b in pairwise(self._times)]
+        if self._is_sent_once and last is not None:
+            return NodeStatus(self.topic, StatusLevel.OK, "received", {"messages": str(self.messages)})
         period = median(periods) if periods else 0.0
         if last is None or now_s - last > max(_SILENT_S, _SILENT_PERIODS * period):
             silence = "nothing yet" if last is None else f"silent for {now_s - last:.0f} s"

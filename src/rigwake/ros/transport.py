@@ -12,8 +12,7 @@ from rigwake.readers.channels import Encoding
 
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, TRANSFORMS = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
-IMAGE_TYPES = (IMAGE, COMPRESSED_IMAGE)
-SENSOR_TYPES = (*IMAGE_TYPES, CAMERA_INFO, TRANSFORMS, "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix")
+STRING = "std_msgs/msg/String"
 
 Answer = tuple[bool, str]
 """Whether a service did what was asked, and words."""
@@ -80,6 +79,9 @@ class Transport(Protocol):
 
     def publish_jpeg(self, name: str, timestamp_ns: int, frame_id: str, jpeg: bytes) -> None:
         """A compressed image on `~name/compressed`."""
+
+    def listeners(self, name: str) -> int:
+        """How many receive `~name/compressed` now: nobody draws a picture that nobody looks at."""
 
     def close(self) -> None:
         """Leave the graph."""

@@ -33,6 +33,7 @@ def track_camera(
     *,
     indices: NDArray[np.int64] | None = None,
     up_cam: Array | None = None,
+    octaves: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Tracks:
     """Follow points through the images of one camera.
@@ -40,7 +41,8 @@ def track_camera(
     stream: must have a model, which turns pixels into bearings and predicts how patches deform.
     mask: regions without static scene points (`lens_mask`, `find_self_mask`, `mask_from_file`); what the lens does not
         show is left out in any case.
-    indices: which frames of the stream to use (all by default). progress: told the number of frames done.
+    indices: which frames of the stream to use (all by default). octaves: how often pictures are halved first (by
+    default as soft ones need it). progress: told the number of frames done.
     The same input gives the same tracks. Raises UsageError if the camera has no model.
     """
     options = options or TrackingOptions()
@@ -51,7 +53,8 @@ def track_camera(
             remedy="Give a model for it, or calibrate one with `rigwake intrinsics`.",
         )
     chosen = np.arange(len(stream)) if indices is None else np.asarray(indices)
-    octaves = octaves_to_skip(stream, chosen) if options.front_end == "klt" else 0
+    if octaves is None:
+        octaves = octaves_to_skip(stream, chosen) if options.front_end == "klt" else 0
     usable = _static_region(stream, options, mask, options.patch_radius_px * 2**octaves)
     front_end = _front_end(stream.model, options, octaves)
     last_ns: int | None = None

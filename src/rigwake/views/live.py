@@ -12,10 +12,11 @@ import av
 import numpy as np
 
 from rigwake._types import Image
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import InputError, UsageError
 from rigwake.views.attitude import LevelAttitude
 from rigwake.views.colour import GainSmoother, colour_samples, fit_colour
-from rigwake.views.frames import FrameSet, FrameWatch, place
+from rigwake.views.frames import FrameSet, FrameWatch, place, require_size
 from rigwake.views.levelling import Leveller
 from rigwake.views.prepare import SurroundOptions, choose_surface
 from rigwake.views.present import Decoration
@@ -122,14 +123,15 @@ class LiveCamera(threading.Thread):
 
 def paired(
     rig: SurroundRig,
-    pictures: Mapping[str, Sequence[tuple[int, Image]]],
+    pictures: Mapping[str, Sequence[tuple[int, Image | Callable[[], Image]]]],
     faults: Mapping[str, str],
     now_ns: int,
     watches: Mapping[str, FrameWatch],
 ) -> FrameSet | None:
     """The newest frame set: at the newest time that every camera which is not silent has reached.
 
-    pictures: (time, picture) by camera, oldest first. A camera silent for more than 1.5 s is missing. None if no
+    pictures: (time, picture, or what decodes it) by camera, oldest first; only what is shown is decoded, and what
+    raises InputError is missing. A camera silent for more than 1.5 s is missing. None if no
     camera has a picture.
     """
     offsets = dict(zip(rig.names, rig.time_offsets_s, strict=True))
@@ -150,14 +152,27 @@ def paired(
         nearest = int(np.abs(times - target).argmin())
         period = float(np.median(np.diff(times))) * 1e-9 if len(times) > 1 else np.inf
         late[index] = float(times[nearest] - target) * 1e-9
-        picture = awake[name][nearest][1]
         if abs(late[index]) > max(0.5 * period, 0.005) + 0.02:
             missing[name] = f"late by {abs(late[index]):.2f} s"
-        elif fault := watches[name].fault(picture, int(times[nearest])):
+            continue
+        try:
+            picture = _decoded(name, awake[name][nearest][1], rig.models[index])
+        except InputError as error:
+            missing[name] = error.cause
+            continue
+        if fault := watches[name].fault(picture, int(times[nearest])):
             missing[name] = fault
         else:
             place(stack[index], picture)
     return FrameSet(target, rig.names, stack, missing, late)
+
+
+def _decoded(name: str, picture: Image | Callable[[], Image], model: CameraModel) -> Image:
+    if not callable(picture):
+        return picture
+    image = picture()
+    require_size(name, image, model.width_px, model.height_px)
+    return image
 
 
 class LiveFeed(threading.Thread):
