@@ -85,7 +85,7 @@ def inspect(
     html: also write the page with plots. Sensors that contradict the others are findings of severity `error`.
     """
     from rigwake.atomic import write_text_atomic
-    from rigwake.inspection.inspection_page import inspection_page
+    from rigwake.report.inspection_page import inspection_page
     from rigwake.pipeline.checked_inspection import inspect_with_checks
 
     inspection, verdict, _ = inspect_with_checks(
