@@ -96,10 +96,12 @@ def _sensors_card(inspection: Inspection) -> Markup:
 
 def _waits_chart(inspection: Inspection, streams: dict[str, NDArray[np.int64]]) -> Markup:
     start, _ = _span_ns(inspection)
-    series = []
+    series: list[Series] = []
     for stamps in (s for s in streams.values() if len(s) > 2):
         waits = periods_s(stamps)
-        times, longest = _peaks_kept((stamps[1:] - start) * 1e-9, waits / max(float(np.median(waits)), 1e-9))
+        times, longest = _peaks_kept(
+            np.asarray((stamps[1:] - start) * 1e-9), waits / max(float(np.median(waits)), 1e-9)
+        )
         series.append(Series("", times, longest, len(series)))
     return line_chart("Longest wait between samples", "time, s", "periods", series)
 
