@@ -68,8 +68,8 @@ def inspect(
     html: also write the page with plots. Sensors that contradict the others are findings of severity `error`.
     """
     from rigwake.atomic import write_text_atomic
-    from rigwake.inspection.inspection_page import inspection_page
     from rigwake.pipeline.checked_inspection import inspect_with_checks
+    from rigwake.report.inspection_page import inspection_page
 
     inspection, verdict, _ = inspect_with_checks(
         opened(recording), lambda what, done, total: progress("inspect", what, done / max(total, 1))

@@ -27,6 +27,7 @@ def command(
         list[float] | None, typer.Option("--range", help="Ranges in metres at which pixels are compared.")
     ] = None,
     json_file: JsonOption = None,
+    html: Annotated[Path | None, typer.Option(help="Write one HTML page with plots.")] = None,
 ) -> None:
     """How far two calibrations are apart: has a camera been knocked, do two recordings agree?
 
@@ -36,6 +37,7 @@ def command(
     for value in range_m or ():
         require_number("--range", value, above=0.0)
     require_writable("--json", json_file)
+    require_writable("--html", html)
     from rigwake.calibration.yaml_file import plain
     from rigwake.evaluation.rig_errors import compare_calibrations
     from rigwake.exporters import in_common_frame, read_calibration
@@ -43,6 +45,11 @@ def command(
     ranges = range_m or [5.0, 20.0, 100.0]
     a, b, notes = in_common_frame(read_calibration(first), read_calibration(second))
     differences = compare_calibrations(a, b, ranges)
+    if html is not None:
+        from rigwake.atomic import write_text_atomic
+        from rigwake.report.diff_page import diff_page
+
+        write_text_atomic(html, diff_page(a, b, differences, ranges, (first.name, second.name), notes))
     if json_file is not None:
         write_json(json_file, plain({"cameras": {name: d.to_json() for name, d in differences.items()}}))
         if str(json_file) == "-":

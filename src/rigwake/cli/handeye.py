@@ -30,6 +30,7 @@ def command(
         Path | None, typer.Option("-o", "--out", "--output", help="Write calibration.yaml here.")
     ] = None,
     json_file: JsonOption = None,
+    html: Annotated[Path | None, typer.Option(help="Write one HTML page with plots.")] = None,
     method: Annotated[
         str,
         typer.Option(
@@ -77,6 +78,7 @@ def command(
     require("--noise", noise, _NOISES)
     require_writable("-o", output)
     require_writable("--json", json_file)
+    require_writable("--html", html)
     inputs = [_Input.parse(text) for text in (reference, *others)]
     require_there(*(one.path for one in inputs))
     from rigwake.calibration import save_calibration
@@ -105,6 +107,11 @@ def command(
         save_calibration(result.calibration(provenance), output)
     if json_file is not None:
         write_json(json_file, result_to_json(result) | {"sensor_checks": checks_to_list(checks)})
+    if html is not None:
+        from rigwake.atomic import write_text_atomic
+        from rigwake.report.handeye_page import handeye_page
+
+        write_text_atomic(html, handeye_page(result, trajectories[0], trajectories[1:], checks))
     if str(json_file) != "-":
         _print(result)
     if not any(camera.has_figures for camera in result.members.values()):

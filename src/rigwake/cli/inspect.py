@@ -50,12 +50,12 @@ def command(
     require_there(recording, topics)
     require_writable("--json", json_file)
     require_writable("--html", html)
-    from rigwake.inspection.inspection_page import inspection_page
     from rigwake.inspection.inspection_summary import inspection_to_dict
     from rigwake.pipeline.checked_inspection import inspect_with_checks
     from rigwake.plausibility.values import checks_to_list
     from rigwake.readers.open import open_recording
     from rigwake.readers.topics import TopicMap
+    from rigwake.report.inspection_page import inspection_page
 
     opened = open_recording(recording, TopicMap.from_options(topic or (), topics, camera_file or ()))
     with progress_bar() as bar:

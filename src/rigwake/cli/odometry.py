@@ -41,7 +41,8 @@ def command(
         Path, typer.Argument(help="ROS bag, MCAP, EuRoC or KITTI folder, folder of images.")
     ],
     output: Annotated[
-        Path, typer.Option("-o", "--out", "--output", help="Folder for NAME.tum, tracks and masks.")
+        Path,
+        typer.Option("-o", "--out", "--output", help="Folder for NAME.tum, tracks, masks and odometry.html."),
     ],
     camera: Annotated[str, typer.Option(help="Name of a camera, or all.")] = "all",
     front_end: Annotated[

@@ -119,11 +119,12 @@ def linearise(
     return BoardNormalEquations(flat.T @ flat, coupling, views, flat.T @ r.ravel(), view_gradients)
 
 
-def camera_scores(estimate: BoardEstimate, corners: Corners, free: Mask) -> Array:
-    """What each corner (N) adds to the gradient of the free camera parameters once the poses follow: (N, P)."""
+def camera_sensitivities(estimate: BoardEstimate, corners: Corners, free: Mask) -> tuple[Array, Array]:
+    """Jacobians (N, 2, P) of the residuals by the free camera parameters once the poses follow, and the residuals
+    (N, 2); zero for corners that are not used."""
     J_camera, J_view, r = _jacobians(estimate, corners, free)
     follow = linearise(estimate, corners, free, None).reduced()[2][:, :, :-1]
-    return np.asarray(np.einsum("nap,na->np", J_camera - J_view @ follow[corners.view_index], r))
+    return np.asarray(J_camera - J_view @ follow[corners.view_index]), r
 
 
 def _jacobians(estimate: BoardEstimate, corners: Corners, free: Mask) -> tuple[Array, Array, Array]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigwake._types import Array, Mask
+from rigwake._types import Array, Indices, Mask
 from rigwake.cameras.models.lens import axis_focal_px
 from rigwake.cameras.protocol import CameraModel
 from rigwake.cameras.registry import camera_class
@@ -17,7 +17,7 @@ from rigwake.intrinsics.board_adjustment import (
     BoardEstimate,
     Corners,
     adjust,
-    camera_scores,
+    camera_sensitivities,
     linearise,
     residuals,
 )
@@ -34,6 +34,7 @@ _POOR_FIT_PX = 3.0
 _FOCAL_TOLERANCE = 0.02
 _RANK_TOLERANCE = 1e-11
 _NULL_FRACTION = 1e-3
+_LEAST_FREEDOM = 0.05  # of a direction that a single view determines nearly alone: its residuals say nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +198,7 @@ def _summary(
     variance = squares / (2 * used.sum() - unknowns)
     corners = replace(corners, used=used)
     information = _Information.of(linearise(estimate, corners, free, None).reduced()[0], variance)
-    widening = _shared_errors(information, camera_scores(estimate, corners, free), corners)
+    widening = _shared_errors(information, *camera_sensitivities(estimate, corners, free), corners)
     information = replace(information, variance=variance * widening)
     block, lost = information.covariance()
     covariance = np.zeros((len(free), len(free)))
@@ -265,7 +266,7 @@ class _Information:
         return float(np.sqrt(self.variance * np.sum(along[self.known] ** 2 / self.eigenvalues[self.known])))
 
 
-def _shared_errors(information: _Information, scores: Array, corners: Corners) -> float:
+def _shared_errors(information: _Information, jacobians: Array, residuals_px: Array, corners: Corners) -> float:
     """How much larger the variance of the camera's parameters is than independent corners make it, at least 1.
 
     The scatter of the scores' sums over views (blur, what the model misses) and over the board's corners (a board
@@ -273,16 +274,31 @@ def _shared_errors(information: _Information, scores: Array, corners: Corners) -
     covariance of Cameron, Gelbach and Miller (2011), as a mean over all determined directions.
     """
     known = information.known
-    whitened = (scores / information.scale) @ information.vectors[:, known]
-    whitened = whitened[corners.used] / np.sqrt(information.eigenvalues[known] * information.variance)
+    whitening = information.vectors[:, known] / np.sqrt(information.eigenvalues[known] * information.variance)
+    whitened = (jacobians[corners.used] / information.scale) @ whitening
+    scores = np.einsum("nap,na->np", whitened, residuals_px[corners.used])
     corner = np.unique(corners.points_board, axis=0, return_inverse=True)[1].ravel()
-    scatter = -float(np.sum(whitened**2))
+    scatter = -float(np.sum(scores**2))
     for cluster in (corners.view_index[corners.used], corner[corners.used]):
-        sums = np.zeros((int(cluster.max()) + 1, whitened.shape[1]))
-        np.add.at(sums, cluster, whitened)
-        count = len(np.unique(cluster))
-        scatter += float(np.sum(sums**2)) * count / max(count - 1, 1)
-    return max(scatter / whitened.shape[1], 1.0)
+        scatter += _scatter_of_sums(whitened, scores, cluster, information.variance)
+    return max(scatter / scores.shape[1], 1.0)
+
+
+def _scatter_of_sums(whitened: Array, scores: Array, cluster: Indices, variance: float) -> float:
+    """Sum of the squared sums of scores (N, P) over each cluster, each made larger by what the fit took from it.
+
+    A view that holds a large part of all information pulls the estimate towards its own errors, so that its residuals
+    are too small: its score has the covariance `A - A A`, not `A`, its part of the whitened information. Multiplying
+    by `(I - A)^-1/2` undoes that (CR2 of Bell and McCaffrey, 2002).
+    """
+    total = 0.0
+    for one in np.unique(cluster):
+        rows = cluster == one
+        J = whitened[rows].reshape(-1, scores.shape[1])
+        part, vectors = np.linalg.eigh(J.T @ J * variance)
+        along = vectors.T @ scores[rows].sum(axis=0)
+        total += float(np.sum(along**2 / np.maximum(1.0 - part, _LEAST_FREEDOM)))
+    return total
 
 
 def _axis_focal_gradient(camera: CameraModel, free: Mask, scale: Array) -> Array:

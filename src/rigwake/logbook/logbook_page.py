@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from html import escape
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +11,7 @@ from rigwake.atomic import write_text_atomic
 from rigwake.evaluation.rig_errors import compare_calibrations
 from rigwake.logbook.store import Logbook
 from rigwake.report.charts import Series, line_chart
+from rigwake.report.html_page import card, figure, html_page, legend, table
 
 
 def write_history(book: Logbook, path: Path) -> None:
@@ -23,7 +22,7 @@ def write_history(book: Logbook, path: Path) -> None:
 def render_history(book: Logbook) -> str:
     """The whole page as text."""
     entries, verdicts = book.calibrations(), book.verdicts()
-    body = f"<header><h1>Logbook {escape(book.path.name)}</h1></header><main>"
+    parts = []
     if entries:
         first = book.load(entries[0].id)
         origin = entries[0].valid_from_ns
@@ -39,30 +38,19 @@ def render_history(book: Logbook) -> str:
             said = [v for v in verdicts if v.camera == name and v.size_deg is not None]
             if said:
                 at = np.array([(v.begin_ns - origin) / 86400e9 for v in said])
-                series.append(Series(f"{name}, monitor", at, np.array([v.size_deg for v in said]), colour))
+                sizes = np.array([v.size_deg for v in said])
+                series.append(Series(f"{name}, monitor", at, sizes, colour, is_dots=True))
         chart = line_chart("Turned since the first calibration", "days", "deg", series)
-        body += f'<section class="card"><h2>Turned since the first calibration</h2>{chart}</section>'
-    rows = "".join(
-        f"<tr><td>{e.id}</td><td>{_time(e.valid_from_ns)}</td><td>{_time(e.valid_to_ns)}</td>"
-        f'<td class="words">{escape(e.note)}</td></tr>'
-        for e in entries
+        words = "Lines: calibrations; dots: what the monitor said."
+        parts.append(card("Turned since the first calibration", legend(turned), figure(chart, words)))
+    rows = [[str(e.id), _time(e.valid_from_ns), _time(e.valid_to_ns), e.note] for e in entries]
+    parts.append(
+        card("Calibrations", table("Calibrations", ["number", "from", "to", "note"], rows, words=(3,)))
     )
-    body += (
-        '<section class="card"><h2>Calibrations</h2><table><tr><th>number</th><th>from</th><th>to</th>'
-        f'<th class="words">note</th></tr>{rows}</table></section>'
-    )
-    rows = "".join(
-        f"<tr><td>{_time(v.begin_ns)}</td><td>{escape(v.recording)}</td><td>{escape(v.camera)}</td>"
-        f'<td>{escape(v.state)}</td><td class="words">{escape(v.words)}</td></tr>'
-        for v in verdicts
-    )
-    body += (
-        '<section class="card"><h2>What the monitor said</h2><table><tr><th>from</th><th>recording</th><th>camera</th>'
-        f'<th>state</th><th class="words">words</th></tr>{rows}</table></section></main>'
-    )
-    css = resources.files("rigwake.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
-    head = f'<meta charset="utf-8"><title>{escape(book.path.name)}</title><style>{css}</style>'
-    return f'<!doctype html><html lang="en"><head>{head}</head><body>{body}</body></html>'
+    rows = [[_time(v.begin_ns), v.recording, v.camera, v.state, v.words] for v in verdicts]
+    head = ["from", "recording", "camera", "state", "words"]
+    parts.append(card("What the monitor said", table("What the monitor said", head, rows, words=(4,))))
+    return html_page(f"Logbook {book.path.name}", parts)
 
 
 def _time(time_ns: int | None) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 from html import escape
-from importlib import resources
 from itertools import pairwise
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from rigwake.monitor.states import CameraState
 from rigwake.monitor.vessel_rig import AXIS_WORDS, camera_axes
 from rigwake.pipeline.outputs import horizon_pixels
 from rigwake.recording import CameraStream, Recording
+from rigwake.report.html_page import html_page
 
 _STYLE = """
 .state.ok { fill: var(--good) } .state.suspect { fill: var(--warn) } .state.drifted { fill: var(--bad) }
@@ -52,20 +52,14 @@ def render_page(result: MonitorResult, recording: Recording) -> str:
     strip = state_strip(scores.cameras, result.judgement.standings)
     ratio = statistic_chart(scores.cameras, result.judgement.statistics.value, result.thresholds.alarm)
     parts = [
-        f"<header><h1>Have the cameras moved? {escape(recording.path.name)}</h1></header><main>",
         f'<div class="verdict {tone}"><strong>{escape(summary)}</strong><ul>{lines}</ul>{notes}</div>',
         f'<section class="card"><h2>Timeline</h2>{strip}<p class="note">{keys}</p>{ratio}</section>',
         *(_evidence(v, result) for v in result.verdicts.values() if v.state is CameraState.DRIFTED),
         *_camera_sections(result),
         _conditions(result),
-        "</main>",
     ]
-    css = resources.files("rigwake.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
-    head = (
-        '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f"<title>monitor {escape(recording.path.name)}</title><style>{css}{_STYLE}</style>"
-    )
-    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(str(p) for p in parts)}</body></html>'
+    title = f"Have the cameras moved? {recording.path.name}"
+    return html_page(title, [Markup(str(part)) for part in parts], style=_STYLE)
 
 
 def _summary(result: MonitorResult) -> tuple[str, str]:

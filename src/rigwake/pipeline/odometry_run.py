@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import cv2
 
 from rigwake._progress import Progress
+from rigwake.atomic import write_text_atomic
 from rigwake.errors import HostError, InputError, RigwakeError, UsageError
 from rigwake.fingerprint import unchanged
 from rigwake.odometry.camera_odometry import CameraOdometry, CameraOdometryOptions, run_camera
@@ -27,6 +28,7 @@ from rigwake.recording import (
     main_gnss,
     main_imu,
 )
+from rigwake.report.odometry_page import odometry_page
 from rigwake.rig import Rig
 from rigwake.tracking.front_ends import track_camera
 from rigwake.trajectory import Trajectory
@@ -87,7 +89,8 @@ def run_odometry(
     progress: Progress = lambda name, what, fraction: None,
     checked: Callable[[tuple[SensorCheck, ...]], None] = lambda checks: None,
 ) -> OdometryRun:
-    """Trajectories of one camera or of all; writes NAME.tum, tracks and masks of those that have one into `out`.
+    """Trajectories of one camera or of all; writes NAME.tum, tracks and masks of those that have one, and the
+    page odometry.html, into `out`.
 
     imu, gnss, attitude: whether to use the recording's. repair: correct the IMU's units. jobs: processes (0: one per
     core). checked: called with the checks of the IMU before the images are read. A camera that fails does not stop
@@ -114,6 +117,7 @@ def run_odometry(
         run = OdometryRun(results, imu_checks, _compared(sensors, streams, results))
         for name, result in run.done.items():
             _write(out, name, result)
+        write_text_atomic(out / "odometry.html", odometry_page(opened, results))
     return run
 
 

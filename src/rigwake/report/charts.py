@@ -19,13 +19,15 @@ COLOURS = 8
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """A line: x, y (N,), NaN breaks it; upper: the other edge of a band above the line; colour: of the palette."""
+    """A line: x, y (N,), NaN breaks it; upper: the other edge of a band above the line; colour: of the palette;
+    is_dots: points that are not joined."""
 
     label: str
     x: Array
     y: Array
     colour: int = 0
     upper: Array | None = None
+    is_dots: bool = False
 
 
 def ticks(low: float, high: float, about: int = 5) -> list[float]:
@@ -40,7 +42,8 @@ def ticks(low: float, high: float, about: int = 5) -> list[float]:
     return [float(k * step) + 0.0 for k in np.arange(first, np.floor(high / step + 1e-9) + 1)]
 
 
-def _label(value: float) -> str:
+def axis_text(value: float) -> str:
+    """A number as it stands at an axis."""
     return f"{value + 0.0:.6g}".replace("-", "−")
 
 
@@ -52,6 +55,7 @@ def line_chart(
     if not drawn:
         return Markup("")
     x_low, x_high = _range([s.x for s in drawn])
+    x_low = 0.0 if 0 < x_low < 0.05 * x_high else x_low
     y_low, y_high = _range([v for s in drawn for v in (s.y, s.upper) if v is not None])
     y_low = min(0.0, y_low) if from_zero else y_low
     pad = 0.06 * (y_high - y_low or 1.0)
@@ -68,12 +72,12 @@ def line_chart(
         v = HEIGHT - _BOTTOM - (y - y_low) * sy
         parts.append(f'<path class="grid" d="M{_LEFT:.1f},{v:.1f}H{WIDTH - _RIGHT:.1f}"/>')
         parts.append(
-            f'<text class="tick" x="{_LEFT - 6:.1f}" y="{v + 4:.1f}" text-anchor="end">{_label(y)}</text>'
+            f'<text class="tick" x="{_LEFT - 6:.1f}" y="{v + 4:.1f}" text-anchor="end">{axis_text(y)}</text>'
         )
     for x in ticks(x_low, x_high):
         u = _LEFT + (x - x_low) * sx
         parts.append(
-            f'<text class="tick" x="{u:.1f}" y="{HEIGHT - _BOTTOM + 16:.1f}" text-anchor="middle">{_label(x)}</text>'
+            f'<text class="tick" x="{u:.1f}" y="{HEIGHT - _BOTTOM + 16:.1f}" text-anchor="middle">{axis_text(x)}</text>'
         )
     for one in drawn:
         parts += _line(one, at)
@@ -82,7 +86,7 @@ def line_chart(
         f'text-anchor="middle">{escape(x_label)}</text>'
         f'<text class="axis" x="4" y="14">{escape(y_label)}</text>'
     )
-    return _svg(title, WIDTH, HEIGHT, parts, "chart")
+    return svg(title, WIDTH, HEIGHT, parts, "chart")
 
 
 def _range(values: Sequence[Array]) -> tuple[float, float]:
@@ -96,6 +100,9 @@ def _line(series: Series, at) -> list[str]:  # type: ignore[no-untyped-def]
     known = np.isfinite(series.y) & np.isfinite(series.x)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
     parts = []
+    if series.is_dots:
+        drawn = (point.split(",") for point in at(series.x[known], series.y[known]))
+        return [f'<circle class="dot {css}" cx="{u}" cy="{v}" r="1.6"/>' for u, v in drawn]
     for start, end in zip(edges[::2], edges[1::2], strict=True):
         x, y = series.x[start:end], series.y[start:end]
         if series.upper is not None:
@@ -125,7 +132,7 @@ def image_map(title: str, data: ImageMap, colour: int) -> Markup:
         )
     if data.mean_px is not None:
         parts += _arrows(data.mean_px, du, dv)
-    return _svg(title, width, height, parts, "map")
+    return svg(title, width, height, parts, "map")
 
 
 def arrow_scale(data: ImageMap) -> float:
@@ -147,8 +154,8 @@ def _arrows(mean_px: Array, du: float, dv: float) -> list[str]:
     return parts
 
 
-def top_view(title: str, paths: Sequence[Series]) -> Markup:
-    """Paths seen from above at one scale, with a bar that gives it; squares mark the starts."""
+def top_view(title: str, paths: Sequence[Series], unit: str = "m") -> Markup:
+    """Paths seen from above at one scale, with a bar that gives it in `unit`; squares mark the starts."""
     drawn = [s for s in paths if np.isfinite(s.y).any()]
     if not drawn:
         return Markup("")
@@ -173,11 +180,14 @@ def top_view(title: str, paths: Sequence[Series]) -> Markup:
     bar = ticks(0, span, 4)[1] if len(ticks(0, span, 4)) > 1 else span
     y = height - 14
     parts.append(f'<path class="scalebar" d="M{margin:.1f},{y:.1f}h{bar * scale:.1f}"/>')
-    parts.append(f'<text class="tick" x="{margin:.1f}" y="{y - 5:.1f}">{_label(bar)} m</text>')
-    return _svg(title, width, height, parts, "map")
+    parts.append(
+        f'<text class="tick" x="{margin:.1f}" y="{y - 5:.1f}">{axis_text(bar)} {escape(unit)}</text>'
+    )
+    return svg(title, width, height, parts, "map")
 
 
-def _svg(title: str, width: float, height: float, parts: Sequence[str], css: str) -> Markup:
+def svg(title: str, width: float, height: float, parts: Sequence[str], css: str) -> Markup:
+    """A drawing whose elements are `parts`. css: `chart` or `map`, which differ in their largest width."""
     head = (
         f'<svg class="{css}" viewBox="0 0 {width:.1f} {height:.1f}" role="img" aria-label="{escape(title)}">'
     )

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from html import escape
-from importlib import resources
-
 import numpy as np
 
 from rigwake.evaluation.trajectory_evaluation import TrajectoryEvaluation
 from rigwake.report.charts import Series, line_chart, top_view
+from rigwake.report.html_page import card, figure, html_page, legend, side_by_side, table
 
 _MOST_POINTS = 2000  # of a line; more would not be seen
 
@@ -17,10 +15,6 @@ def trajectory_page(evaluation: TrajectoryEvaluation, found: str, truth: str) ->
     """One HTML file: the figures, both paths from above, the errors over time. found, truth: names of the files."""
     e = evaluation
     step = max(1, -(-len(e.times_s) // _MOST_POINTS))
-    rows = "".join(
-        f'<tr><td class="words">{escape(what)}</td><td>{escape(value)}</td></tr>'
-        for what, value in figures_in_words(e)
-    )
     paths = top_view(
         "Both paths from above",
         [
@@ -28,23 +22,21 @@ def trajectory_page(evaluation: TrajectoryEvaluation, found: str, truth: str) ->
             Series("found", e.found_world[::step, 0], e.found_world[::step, 1], 1),
         ],
     )
-    charts = [paths]
+    charts = [figure(paths, "From above; the squares mark the starts.")]
     for title, unit, values, colour in (
         ("Position error", "m", e.position_error_m, 0),
         ("Rotation error", "deg", e.rotation_error_deg, 1),
     ):
         line = Series(title, e.times_s[::step], np.asarray(values[::step], np.float64), colour)
-        charts.append(line_chart(title, "s", unit, [line]))
-    cards = "".join(f'<section class="card">{chart}</section>' for chart in charts)
-    css = resources.files("rigwake.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
-    title = escape(f"{found} against {truth}")
-    head = (
-        '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{css}</style>"
-    )
-    return (
-        f'<!doctype html><html lang="en"><head>{head}</head><body><header><h1>{title}</h1></header><main>'
-        f'<section class="card"><h2>Errors</h2><table>{rows}</table></section>{cards}</main></body></html>'
+        charts.append(figure(line_chart(title, "time, s", unit, [line]), f"{title} over time."))
+    rows = [list(row) for row in figures_in_words(e)]
+    return html_page(
+        f"{found} against {truth}",
+        [
+            card("Errors", table("Errors", ["figure", "value"], rows)),
+            card("Paths", legend(("known", "found")), charts[0]),
+            card("Over time", side_by_side(*charts[1:])),
+        ],
     )
 
 

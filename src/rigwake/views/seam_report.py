@@ -5,14 +5,15 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from itertools import pairwise
 from typing import Any
 
 import cv2
 import numpy as np
+from markupsafe import Markup
 
 from rigwake._types import Image
+from rigwake.report.html_page import card, figure, html_page, listing, note, table
 from rigwake.views.prepare import SurroundSetup
 from rigwake.views.projections import CylinderView
 from rigwake.views.seam_blame import CameraBlame, blame_cameras
@@ -20,12 +21,7 @@ from rigwake.views.seams import PX_PER_RAD, RANGE_EDGES_M, SeamMatches, SeamMete
 from rigwake.views.surround_view import SurroundView, blind_sectors
 
 _FEW = 8  # matches: fewer give no figure
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #1f2328 }
-table { border-collapse: collapse; margin: 1em 0 } td, th { padding: .3em .8em; border-bottom: 1px solid #d1d9e0;
-text-align: left } td.n { text-align: right } img { max-width: 100% } .bad { color: #cf222e; font-weight: 600 }
-@media (prefers-color-scheme: dark) { body { background: #0d1117; color: #e6edf3 } td, th { border-color: #30363d } }
-"""
+_STYLE = "img.wide { display: block; width: 100%; height: auto }"
 
 
 @dataclass(frozen=True)
@@ -216,28 +212,36 @@ def report_page(report: SeamReport, setup: SurroundSetup, title: str) -> str:
     view = SurroundView(setup.rig, CylinderView(1600, 400, 25, -35), setup.masks, setup.colour)
     picture = view.picture(frames, attitude, setup.surface_at(frames, attitude))
     _mark_seams(picture, report)
-    parts = [
-        f"<h1>Seams of {escape(title)}</h1>",
-        f"<p>{report.frame_sets} frame sets; {escape(setup.leveller.words)}; shell at {setup.shell_m:.0f} m. "
-        "A pixel is one of a panorama of 2048 around (0.18 degrees).</p>",
-        f'<img alt="panorama with the seams marked" src="{_data_uri(picture)}">',
-        seam_table(report),
-        camera_table(report),
-        "".join(f"<p>{escape(line)}</p>" for line in (*report.lines(), *setup.notes)),
-    ]
-    head = f'<meta charset="utf-8"><title>seams of {escape(title)}</title><style>{_STYLE}</style>'
-    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(parts)}</body></html>'
+    words = f"Panorama of {title}, the seams marked"
+    return html_page(
+        f"Seams of {title}",
+        [
+            card(
+                "Panorama",
+                figure(
+                    Markup('<img class="wide" alt="{}" src="{}">').format(words, _data_uri(picture)), words
+                ),
+            ),
+            card(
+                "Seams",
+                seam_table(report),
+                note("A pixel is one of a panorama of 2048 around (0.18 degrees)."),
+            ),
+            card("Cameras", camera_table(report), listing((*report.lines(), *setup.notes))),
+        ],
+        f"{report.frame_sets} frame sets; {setup.leveller.words}; shell at {setup.shell_m:.0f} m.",
+        _STYLE,
+    )
 
 
-def seam_table(report: SeamReport) -> str:
+def seam_table(report: SeamReport) -> Markup:
     """The table of seams as HTML."""
     heads = ["seam", "azimuth", "overlap", "matches", "misalignment"]
     bins = report.seams[0].bins if report.seams else ()
     heads += [_range_words(b) for b in bins] + ["colours", "uncorrected"]
-    rows = []
-    for seam in report.seams:
-        cells = [
-            f"<td>{escape(seam.first)}|{escape(seam.second)}</td>",
+    rows = [
+        [
+            f"{seam.first}|{seam.second}",
             _cell(seam.azimuth_deg, "deg", 0),
             _cell(seam.overlap_deg, "deg", 0),
             _cell(seam.matches, "", 0),
@@ -246,22 +250,24 @@ def seam_table(report: SeamReport) -> str:
             _cell(seam.difference, "", 1),
             _cell(seam.difference_raw, "", 1),
         ]
-        rows.append(f"<tr>{''.join(cells)}</tr>")
-    return f"<table><tr>{''.join(f'<th>{h}</th>' for h in heads)}</tr>{''.join(rows)}</table>"
+        for seam in report.seams
+    ]
+    return table("Seams", heads, rows)
 
 
-def camera_table(report: SeamReport) -> str:
+def camera_table(report: SeamReport) -> Markup:
     """The table of rotations as HTML."""
-    rows = []
-    for blame in report.blames:
-        verdict = '<span class="bad">stands out</span>' if blame.is_to_blame else "agrees"
-        x, y, z = blame.rotation_deg
-        rows.append(
-            f"<tr><td>{escape(blame.name)}</td><td class=n>{x:+.2f}</td><td class=n>{y:+.2f}</td>"
-            f"<td class=n>{z:+.2f}</td><td class=n>{blame.std_deg:.2f}</td><td>{verdict}</td></tr>"
-        )
-    heads = ["camera", "about ahead (deg)", "about port (deg)", "about up (deg)", "std (deg)", ""]
-    return f"<table><tr>{''.join(f'<th>{h}</th>' for h in heads)}</tr>{''.join(rows)}</table>" if rows else ""
+    rows = [
+        [
+            blame.name,
+            *(f"{x:+.2f}" for x in blame.rotation_deg),
+            f"{blame.std_deg:.2f}",
+            "stands out" if blame.is_to_blame else "agrees",
+        ]
+        for blame in report.blames
+    ]
+    heads = ["camera", "about ahead, °", "about port, °", "about up, °", "std, °", "verdict"]
+    return table("Cameras", heads, rows)
 
 
 def _range_words(b: RangeBin) -> str:
@@ -269,8 +275,7 @@ def _range_words(b: RangeBin) -> str:
 
 
 def _cell(value: float, unit: str, digits: int) -> str:
-    words = f"{value:.{digits}f} {unit}".strip() if np.isfinite(value) else "-"
-    return f"<td class=n>{words}</td>"
+    return f"{value:.{digits}f} {unit}".strip() if np.isfinite(value) else "–"
 
 
 def _mark_seams(picture: Image, report: SeamReport) -> None:
