@@ -319,10 +319,10 @@ def monitor(
     from rigwake.tracking.hull_picture import load_hull_pictures
 
     calibrated, watched = calibration_of(calibration), opened(recording)
-    is_file = isinstance(calibration, str | Path)
-    hull = load_hull_pictures(Path(calibration).parent / "masks", calibrated.cameras) if is_file else {}
+    file = Path(calibration) if isinstance(calibration, str | Path) else None
+    hull = {} if file is None else load_hull_pictures(file.parent / "masks", calibrated.cameras)
     result = run(calibrated, watched, progress, hull=hull)
-    note = Path(calibration).name if is_file else ""
+    note = "" if file is None else file.name
     keep_result(
         calibrated,
         watched,
