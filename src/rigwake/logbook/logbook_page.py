@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from html import escape
 from importlib import resources
@@ -35,13 +36,14 @@ def render_history(book: Logbook) -> str:
                 values.append(differences[name].rotation_deg if name in differences else float("nan"))
         series = []
         for colour, (name, values) in enumerate(turned.items()):
-            series.append(Series(name, days, np.array(values), colour))
+            # one calibration holds until the next
+            series.append(Series(name, np.repeat(days, 2)[1:], np.repeat(values, 2)[:-1], colour))
             said = [v for v in verdicts if v.camera == name and v.size_deg is not None]
             if said:
                 at = np.array([(v.begin_ns - origin) / 86400e9 for v in said])
                 series.append(Series(f"{name}, monitor", at, np.array([v.size_deg for v in said]), colour))
         chart = line_chart("Turned since the first calibration", "days", "deg", series)
-        body += f'<section class="card"><h2>Turned since the first calibration</h2>{chart}</section>'
+        body += f'<section class="card"><h2>Turned since the first calibration</h2>{_legend(turned)}{chart}</section>'
     rows = "".join(
         f"<tr><td>{e.id}</td><td>{_time(e.valid_from_ns)}</td><td>{_time(e.valid_to_ns)}</td>"
         f'<td class="words">{escape(e.note)}</td></tr>'
@@ -56,6 +58,7 @@ def render_history(book: Logbook) -> str:
         f'<td>{escape(v.state)}</td><td class="words">{escape(v.words)}</td></tr>'
         for v in verdicts
     )
+    rows = rows or '<tr><td colspan="5">nothing yet: rigwake monitor --log</td></tr>'
     body += (
         '<section class="card"><h2>What the monitor said</h2><table><tr><th>from</th><th>recording</th><th>camera</th>'
         f'<th>state</th><th class="words">words</th></tr>{rows}</table></section></main>'
@@ -63,6 +66,15 @@ def render_history(book: Logbook) -> str:
     css = resources.files("rigwake.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
     head = f'<meta charset="utf-8"><title>{escape(book.path.name)}</title><style>{css}</style>'
     return f'<!doctype html><html lang="en"><head>{head}</head><body>{body}</body></html>'
+
+
+def _legend(names: Iterable[str]) -> str:
+    """Which colour is which camera."""
+    items = (
+        f'<li><span class="swatch s{colour % 8}" aria-hidden="true"></span>{escape(name)}</li>'
+        for colour, name in enumerate(names)
+    )
+    return f'<ul class="legend">{"".join(items)}</ul>'
 
 
 def _time(time_ns: int | None) -> str:
