@@ -68,19 +68,19 @@ def overhead(out: str) -> None:
     print(f"Dask, 1 worker            {1e3 * ours:6.2f} ms a task; bare Dask {1e3 * bare:.2f} ms", flush=True)
 
 
-def growth(out: str) -> None:
+def growth(out: str, each: int = 3) -> None:
     cores = os.cpu_count() or 1
     first = None
     for workers in sorted({1, 2, cores} & set(range(1, cores + 1))):
         with local_pool(workers) as pool:
             timed(pool, jobs(out, workers, RIG))  # imports, compiled loops
             before, begun = cpu_of_children(pool), time.perf_counter()
-            timed(pool, jobs(out, 6 * workers, RIG))
+            timed(pool, jobs(out, each * workers, RIG))
             wall, cpu = time.perf_counter() - begun, cpu_of_children(pool) - before
-        rate = 6 * workers / cpu
+        rate = each * workers / cpu
         first = first or rate
         print(
-            f"{workers} workers: {6 * workers / wall / workers:.3f} rigs per worker and second of wall clock, "
+            f"{workers} workers: {each * workers / wall / workers:.3f} rigs per worker and second of wall clock, "
             f"{rate:.3f} per CPU-second ({rate / first:.2f} of one worker)",
             flush=True,
         )

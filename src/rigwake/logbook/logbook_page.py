@@ -29,6 +29,7 @@ def render_history(book: Logbook) -> str:
         first = book.load(entries[0].id)
         origin = entries[0].valid_from_ns
         days = np.array([(entry.valid_from_ns - origin) / 86400e9 for entry in entries])
+        latest = max([days[-1], *((v.begin_ns - origin) / 86400e9 for v in verdicts)])
         turned: dict[str, list[float]] = {name: [] for name in first.cameras}
         for entry in entries:
             differences = compare_calibrations(first, book.load(entry.id), [20.0])
@@ -36,8 +37,9 @@ def render_history(book: Logbook) -> str:
                 values.append(differences[name].rotation_deg if name in differences else float("nan"))
         series = []
         for colour, (name, values) in enumerate(turned.items()):
-            # one calibration holds until the next
-            series.append(Series(name, np.repeat(days, 2)[1:], np.repeat(values, 2)[:-1], colour))
+            # one calibration holds until the next, the last one still
+            until = np.append(np.repeat(days, 2)[1:], latest + 0.05 * (latest or 1.0))
+            series.append(Series(name, until, np.repeat(values, 2), colour))
             said = [v for v in verdicts if v.camera == name and v.size_deg is not None]
             if said:
                 at = np.array([(v.begin_ns - origin) / 86400e9 for v in said])
