@@ -49,23 +49,37 @@ def timed(runner: FleetRunner, wanted: Iterator[FleetJob]) -> float:
     return (time.perf_counter() - begun) / len(done)
 
 
-def overhead(out: str) -> None:
-    count = 2000
+def overhead(out: str, count: int = 2000) -> None:
+    """Per task: seconds of the clock, and CPU of all processes together, which a busy machine does not change."""
     with local_pool(1) as pool:
         timed(pool, jobs(out, 2, NULL))  # the process starts
-        print(
-            f"local pool, 1 process     {1e3 * timed(pool, jobs(out, count, NULL)):6.2f} ms a task",
-            flush=True,
-        )
+        said("local pool, 1 process", lambda: timed(pool, jobs(out, count, NULL)), count)
     with dask_client("local:1") as client:
         runner = DaskRunner(client)
         timed(runner, jobs(out, 2, NULL))
-        ours = timed(runner, jobs(out, count, NULL))
-        begun = time.perf_counter()
-        for future in client.map(abs, range(count), pure=False):
-            future.result()
-        bare = (time.perf_counter() - begun) / count
-    print(f"Dask, 1 worker            {1e3 * ours:6.2f} ms a task; bare Dask {1e3 * bare:.2f} ms", flush=True)
+        said("Dask, 1 worker", lambda: timed(runner, jobs(out, count, NULL)), count)
+
+        def bare() -> None:
+            for future in client.map(abs, range(count), pure=False):
+                future.result()
+
+        said("Dask itself, no work", bare, count)
+
+
+def said(what: str, work: Callable[[], object], count: int) -> None:
+    before, begun = cpu_of_all(), time.perf_counter()
+    work()
+    wall, cpu = time.perf_counter() - begun, cpu_of_all() - before
+    print(f"{what:24s} {1e3 * wall / count:6.2f} ms a task, {1e3 * cpu / count:5.2f} ms CPU", flush=True)
+
+
+def cpu_of_all() -> float:
+    """Seconds of CPU of this process and all that it has started and that still run."""
+    import psutil
+
+    this = psutil.Process()
+    times = [process.cpu_times() for process in (this, *this.children(recursive=True))]
+    return sum(t.user + t.system for t in times)
 
 
 def growth(out: str, each: int = 3) -> None:
