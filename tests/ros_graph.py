@@ -37,6 +37,10 @@ elif what == "calibrate":
     rospy.wait_for_service("/rigwake/calibrate", 15)
     answer = rospy.ServiceProxy("/rigwake/calibrate", Trigger)()
     print(json.dumps([answer.success, answer.message]))
+elif what == "surround":
+    from sensor_msgs.msg import CompressedImage
+    found = rospy.wait_for_message("/rigwake/surround/compressed", CompressedImage, timeout=50)
+    print(json.dumps([found.header.frame_id, found.header.stamp.to_nsec(), found.format, bytes(found.data).hex()]))
 elif what == "tf":
     buffer = tf2_ros.Buffer()
     listener = tf2_ros.TransformListener(buffer)

@@ -229,7 +229,7 @@ def test_horizon_pixels_look_at_right_angles_to_up(world: SimulatedTracks, up: l
 def test_json_files_hold_no_nan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A camera of which nothing was placed has residuals that are no number: null in every file."""
     outcome = CameraOutcome("front", None, counts={"odometry": {"inlier_rms_px": np.nan, "inliers": 0}})
-    monkeypatch.setattr("rigwake.pipeline.camera_stage._process", lambda job, progress: outcome)
+    monkeypatch.setattr("rigwake.pipeline.camera_stage._process", lambda job, progress, stretches: outcome)
     stream = CameraStream("front", np.arange(2), None, 4, 4)
     process_camera(CameraJob(stream, None, tmp_path, CalibrateConfig()), lambda words, part: None)
     text = outcome_file(tmp_path, "front").read_text()

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from basin_recording import basin, basin_recording
@@ -20,13 +21,14 @@ from cli_runs import run
 from rigwake.calibration import load_calibration, save_calibration
 from rigwake.config import load_config
 from rigwake.errors import UsageError
-from rigwake.fleet.dask_run import cameras_on_cluster
+from rigwake.fleet.drift_history import drift_points
 from rigwake.fleet.fleet_jobs import FleetJob
-from rigwake.fleet.fleet_page import drift_points
 from rigwake.fleet.recording_list import list_recordings
 from rigwake.fleet.resume import read_outcome
 from rigwake.fleet.run_one import check_machine, run_one
+from rigwake.geometry import so3
 from rigwake.pipeline.calibration_run import calibrate
+from rigwake.tracks import load_tracks
 from rigwake.writers.write import write_recording
 
 pytestmark = pytest.mark.xdist_group("fleet")
@@ -120,12 +122,21 @@ class TestCalibrate:
 
     def test_cameras_of_one_recording_on_a_cluster(self, boats: Boats, tmp_path: Path) -> None:
         pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
-        (folder,) = boats.out.glob("recordings/one-*")
-        found = calibrate(
-            boats.folder / "kiel" / "one.bag", tmp_path / "o", run_cameras=cameras_on_cluster("local:1")
-        ).calibration
-        for name, camera in load_calibration(folder / "calibration.yaml").cameras.items():
-            assert abs(found.cameras[name].rig_from_cam.matrix - camera.rig_from_cam.matrix).max() < 1e-9
+        bag, settings = boats.folder / "kiel" / "one.bag", load_config(jobs=1, stretch_s=10.0)
+        here = calibrate(bag, tmp_path / "here", settings).calibration
+        words = ("--set", "stretch_s=10", "--jobs", 1, "--scheduler", "local:1")
+        ended = run("calibrate", bag, "-o", tmp_path / "there", *words)
+        assert ended.code == 0, ended.words
+        there = load_calibration(tmp_path / "there" / "calibration.yaml")
+        for name, camera in here.cameras.items():
+            first, second = (load_tracks(tmp_path / o / "tracks" / f"{name}.npz") for o in ("here", "there"))
+            np.testing.assert_array_equal(first.pixels, second.pixels)  # wherever a stretch is tracked
+            np.testing.assert_array_equal(first.track_ids, second.track_ids)
+            assert abs(there.cameras[name].rig_from_cam.matrix - camera.rig_from_cam.matrix).max() < 1e-9
+        (whole,) = boats.out.glob("recordings/one-*")
+        for name, camera in load_calibration(whole / "calibration.yaml").cameras.items():
+            apart = camera.rig_from_cam.inverse() * here.cameras[name].rig_from_cam
+            assert abs(so3.log(apart.rotation)).max() < 5 * np.deg2rad(camera.std_rotation_deg.max())
 
     def test_the_same_rig_twice_is_no_drift(self, boats: Boats) -> None:
         outcomes = [o for f in boats.out.glob("recordings/*") if (o := read_outcome(f)) and o.is_done]

@@ -80,6 +80,7 @@ def test_a_fleet_names_the_camera_that_moved(harbour: Path) -> None:
     assert rows["bremen", "front"]["state"] != "DRIFTED"
     assert float(rows["bremen", "left"]["size_deg"]) == pytest.approx(1.0, abs=0.15)
     page = (harbour / "out" / "fleet.html").read_text()
+    assert "Cameras that moved" in page
     assert "DRIFTED" in page
     before = {p: p.stat().st_mtime_ns for p in (harbour / "out" / "recordings").glob("*/monitor.json")}
     assert run(*words).code == 5

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import psutil
 import pytest
@@ -15,7 +16,7 @@ import pytest
 from basin_recording import basin, basin_recording
 from calibrated_rigs import boat
 from cli_runs import run
-from rigwake.calibration import load_calibration, save_calibration
+from rigwake.calibration import CalibratedCamera, Calibration, load_calibration, save_calibration
 from rigwake.config import load_config
 from rigwake.geometry import so3
 from rigwake.pipeline.calibration_run import calibrate
@@ -143,6 +144,28 @@ def _tf(graph: RosGraph, parent: str, child: str) -> Any:
         return graph.look("tf", parent, child)
     except RuntimeError:
         return None
+
+
+def test_whoever_looks_gets_the_surround_view(graph: RosGraph, bag: Path, tmp_path: Path) -> None:
+    """Another node subscribes, and a panorama comes; before, nothing was drawn."""
+    simulated = basin()
+    cameras = {
+        name: CalibratedCamera(name, c.rig_from_cam, np.eye(6) * 1e-8, model=c.model)
+        for name, c in simulated.rig.cameras.items()
+    }
+    save_calibration(Calibration("base_link", cameras), tmp_path / "c.yaml")
+    graph.start_node("--out", tmp_path / "out", "--calibration", tmp_path / "c.yaml")
+    assert graph.look("record", "off")[0]  # it is there
+    graph.play(bag, "--loop", "--delay=1")
+    assert "surround" not in graph.look("diagnostics")
+    frame_id, stamp_ns, kind, jpeg = graph.look("surround")
+    assert (frame_id, kind) == ("base_link", "jpeg")
+    stamps = open_recording(bag).cameras["front"].timestamps_ns
+    assert stamps[0] - 10**8 <= stamp_ns <= stamps[-1] + 10**8
+    picture = cv2.imdecode(np.frombuffer(bytes.fromhex(jpeg), np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (500, 1600, 3)
+    assert picture.std() > 20
+    assert "rigwake/surround/compressed" not in str(graph.look("diagnostics"))  # it does not record itself
 
 
 def test_a_clock_that_jumps_back(graph: RosGraph, bag: Path, tmp_path: Path) -> None:

@@ -102,6 +102,24 @@ def test_a_clock_that_jumps_back_begins_another_bag(sails: dict[str, Path], tmp_
     node.close()
 
 
+def test_a_clock_that_jumps_back_on_a_full_disk(
+    sails: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No other bag can begin: that is said, and messages go on being received."""
+    transport = ReplayTransport(index_of(sails, "ros1"))
+    node = RigwakeNode(transport, NodeOptions(tmp_path / "out", least_free=0))
+    node.step()
+    node.record(True)
+    transport.play()
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=-1))
+    assert transport.play() > 100
+    recording = next(s for s in node.statuses(time.monotonic()) if s.name == "recording")
+    assert recording.level is StatusLevel.ERROR
+    assert "MiB are free" in recording.message
+    node.close()
+
+
 FAKE = "import sys, shutil, time, pathlib, json\n"
 
 

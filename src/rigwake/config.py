@@ -50,7 +50,7 @@ class CalibrateConfig(BaseModel):
     cameras: tuple[str, ...] = ()
     start_s: float = Field(default=0.0, ge=0, allow_inf_nan=False)
     duration_s: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    stretch_s: float | None = Field(default=None, ge=20, allow_inf_nan=False)
+    stretch_s: float | None = Field(default=None, ge=10, allow_inf_nan=False)
     min_duration_s: float = Field(default=15.0, gt=0, allow_inf_nan=False)
     jobs: int = Field(default=0, ge=0)
     seed: int = 0

@@ -7,39 +7,27 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
+from itertools import cycle
 from typing import Any
 
 import jinja2
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from rigwake import __version__
+from rigwake.fleet.drift_history import FLOOR_DEG, DriftHistory, DriftPoint
 from rigwake.fleet.fleet_jobs import FAILED, NOT_OBSERVABLE, FleetOutcome
-from rigwake.geometry import so3
 
 _MOST_ROWS = 2000  # of the table on the page; the CSV file has all
 _MOST_VESSELS = 60
-_OUTLIER_SIGMAS = 5.0
-_FLOOR_DEG = 0.02  # differences below say nothing about a mount
+_MOST_MOVED = 500
+_MOST_OUTLIERS = 200
+_MOST_POINTS = 2000  # of a chart
+_MOVED = ("DRIFTED", "SUSPECT")
 _EARLIEST_NS, _LATEST_NS = 0, 4_102_444_800_000_000_000  # the year 2100
-_WIDTH, _HEIGHT, _MARGIN = 640, 160, 36
+_WIDTH, _HEIGHT, _MARGIN, _TOP = 640, 170, 36, 26
+_LONGEST_NAME = 24
 _COLOURS = ("#1b6ca8", "#c1440e", "#3a7d44", "#7d4a9c", "#9c7a1b", "#4a6c7d")
-
-
-@dataclass(frozen=True)
-class DriftPoint:
-    """One camera in one recording: how far it is turned from the vessel's median, with its standard deviation."""
-
-    started_ns: int
-    recording: str
-    camera: str
-    turned_deg: float
-    std_deg: float
-
-    @property
-    def is_outlier(self) -> bool:
-        """Beyond what its own uncertainty explains."""
-        return self.turned_deg > _OUTLIER_SIGMAS * max(self.std_deg, _FLOOR_DEG)
 
 
 @dataclass
@@ -49,8 +37,9 @@ class _Seen:
     counts: Counter[str] = field(default_factory=Counter)
     causes: dict[str, list[FleetOutcome]] = field(default_factory=lambda: defaultdict(list))
     cause_counts: Counter[str] = field(default_factory=Counter)
-    vessels: dict[str, list[FleetOutcome]] = field(default_factory=lambda: defaultdict(list))
+    vessels: dict[str, DriftHistory] = field(default_factory=lambda: defaultdict(DriftHistory))
     rows: list[FleetOutcome] = field(default_factory=list)
+    moved: list[tuple[FleetOutcome, str, Mapping[str, Any]]] = field(default_factory=list)
 
 
 def render_page(outcomes: Iterable[FleetOutcome], wanted: int, csv_name: str) -> str:
@@ -62,13 +51,23 @@ def render_page(outcomes: Iterable[FleetOutcome], wanted: int, csv_name: str) ->
             seen.cause_counts[outcome.cause] += 1
             if len(seen.causes[outcome.cause]) < 10:
                 seen.causes[outcome.cause].append(outcome)
+        for name, camera in outcome.cameras.items():
+            if camera.get("state") in _MOVED and len(seen.moved) < _MOST_MOVED:
+                seen.moved.append((outcome, name, camera))
         if outcome.is_done and outcome.cameras:
-            seen.vessels[outcome.vessel].append(outcome)
+            seen.vessels[outcome.vessel].add(outcome)
         if len(seen.rows) < _MOST_ROWS:
             seen.rows.append(outcome)
-    drifts = {vessel: drift_points(found) for vessel, found in sorted(seen.vessels.items())}
-    outliers = [(vessel, point) for vessel, points in drifts.items() for point in points if point.is_outlier]
-    charts = {v: drift_chart(points) for v, points in list(drifts.items())[:_MOST_VESSELS] if len(points) > 1}
+    charts: dict[str, Markup] = {}
+    outliers: list[tuple[str, DriftPoint]] = []
+    outlier_count = 0
+    for vessel in sorted(seen.vessels):
+        points = seen.vessels[vessel].points()
+        odd = [point for point in points if point.is_outlier]
+        outlier_count += len(odd)
+        outliers += [(vessel, point) for point in odd[: _MOST_OUTLIERS - len(outliers)]]
+        if len(points) > 1 and len(charts) < _MOST_VESSELS:
+            charts[vessel] = drift_chart(thinned(points))
     return (
         _environment()
         .get_template("fleet.html.j2")
@@ -78,10 +77,11 @@ def render_page(outcomes: Iterable[FleetOutcome], wanted: int, csv_name: str) ->
             done=sum(seen.counts.values()),
             wanted=wanted,
             causes=[(cause, n, seen.causes[cause]) for cause, n in seen.cause_counts.most_common()],
-            outliers=outliers[:200],
-            outlier_count=len(outliers),
+            moved=sorted(seen.moved, key=lambda found: found[2]["state"]),
+            outliers=outliers,
+            outlier_count=outlier_count,
             charts=charts,
-            vessels_left_out=max(len(drifts) - _MOST_VESSELS, 0),
+            vessels_left_out=max(len(seen.vessels) - _MOST_VESSELS, 0),
             rows=seen.rows,
             csv_name=csv_name,
             date=_date,
@@ -107,39 +107,13 @@ def _date(time_ns: int | None) -> str:
     return datetime.fromtimestamp(time_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M")
 
 
-def drift_points(outcomes: Sequence[FleetOutcome]) -> list[DriftPoint]:
-    """How far every camera of one vessel is turned from its median over all recordings, in the order of time.
-
-    The median is the recording's rotation that is nearest to all others. Rigs in other frames are not compared; of a
-    monitored vessel it is the size of the drift that the monitor states.
-    """
-    points: list[DriftPoint] = []
-    by_camera: dict[tuple[str, str], list[tuple[FleetOutcome, Mapping[str, Any]]]] = defaultdict(list)
-    for outcome in outcomes:
-        for name, camera in outcome.cameras.items():
-            quat = camera.get("quat_wxyz")
-            if quat and None not in quat:
-                by_camera[outcome.reference, name].append((outcome, camera))
-            elif camera.get("size_deg") is not None:
-                points.append(_point(outcome, name, camera["size_deg"], camera.get("size_std_deg") or 0.0))
-    for (_, name), found in by_camera.items():
-        rotations = so3.matrix_from_quat_wxyz(np.array([camera["quat_wxyz"] for _, camera in found]))
-        for (outcome, camera), turned in zip(found, _turned_from_median(rotations), strict=True):
-            stds = [s for s in camera.get("std_rotation_deg") or [] if s is not None]
-            points.append(_point(outcome, name, float(turned), max(stds, default=0.0)))
-    return sorted(points, key=lambda p: (p.started_ns, p.recording, p.camera))
-
-
-def _turned_from_median(rotations: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Degrees of every rotation from the one in the middle, judged by at most 200 others."""
-    sample = rotations[:: max(len(rotations) // 200, 1)]
-    cosines = (np.einsum("nij,mij->nm", sample, sample) - 1) / 2
-    middle = sample[int(np.arccos(np.clip(cosines, -1, 1)).sum(axis=1).argmin())]
-    return np.rad2deg(np.linalg.norm(so3.log(np.swapaxes(rotations, 1, 2) @ middle), axis=1))
-
-
-def _point(outcome: FleetOutcome, camera: str, turned: float, std: float) -> DriftPoint:
-    return DriftPoint(outcome.started_ns or 0, outcome.recording, camera, turned, std)
+def thinned(points: Sequence[DriftPoint]) -> list[DriftPoint]:
+    """At most some thousand points in their order: outliers first of all, the others evenly thinned."""
+    if len(points) <= _MOST_POINTS:
+        return list(points)
+    odd = [k for k, point in enumerate(points) if point.is_outlier][: _MOST_POINTS // 2]
+    others = np.linspace(0, len(points) - 1, _MOST_POINTS - len(odd)).astype(int).tolist()
+    return [points[k] for k in sorted({*odd, *others})]
 
 
 def drift_chart(points: Sequence[DriftPoint]) -> Markup:
@@ -147,22 +121,29 @@ def drift_chart(points: Sequence[DriftPoint]) -> Markup:
     cameras = sorted({point.camera for point in points})
     times = np.array([point.started_ns for point in points], dtype=np.float64)
     span = float(np.ptp(times)) or 1.0
-    top = max(max(point.turned_deg + point.std_deg for point in points), _FLOOR_DEG) * 1.05
+    top = max(max(point.turned_deg + point.std_deg for point in points), FLOOR_DEG) * 1.05
     parts = [
         f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="Turn from the median in degrees over time">',
-        f'<path d="M{_MARGIN} 8V{_HEIGHT - 20}H{_WIDTH - 8}" fill="none" stroke="currentColor" opacity="0.5"/>',
-        f'<text x="2" y="16">{top:.2f}°</text><text x="2" y="{_HEIGHT - 20}">0°</text>',
+        f'<path d="M{_MARGIN} {_TOP}V{_HEIGHT - 20}H{_WIDTH - 8}" fill="none" stroke="currentColor" opacity="0.5"/>',
+        f'<text x="2" y="{_TOP + 8}">{top:.2f}°</text><text x="2" y="{_HEIGHT - 20}">0°</text>',
         f'<text x="{_MARGIN}" y="{_HEIGHT - 4}">{_date(points[0].started_ns)}</text>',
         f'<text x="{_WIDTH - 8}" y="{_HEIGHT - 4}" text-anchor="end">{_date(points[-1].started_ns)}</text>',
     ]
     for point, time in zip(points, times, strict=True):
         x = _MARGIN + 8 + (time - times.min()) / span * (_WIDTH - _MARGIN - 24)
-        y = [_HEIGHT - 20 - v / top * (_HEIGHT - 30) for v in _band(point)]
+        y = [_HEIGHT - 20 - v / top * (_HEIGHT - 20 - _TOP) for v in _band(point)]
         colour = _COLOURS[cameras.index(point.camera) % len(_COLOURS)]
         parts.append(
             f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{y[0]:.1f}" y2="{y[2]:.1f}" stroke="{colour}" opacity="0.5"/>'
             f'<circle cx="{x:.1f}" cy="{y[1]:.1f}" r="{4 if point.is_outlier else 2.5}" fill="{colour}"/>'
         )
+    x = float(_MARGIN + 12)
+    for name, colour in zip(cameras, cycle(_COLOURS), strict=False):
+        words = name[:_LONGEST_NAME]
+        parts.append(
+            f'<circle cx="{x:.0f}" cy="8" r="3" fill="{colour}"/><text x="{x + 7:.0f}" y="12">{escape(words)}</text>'
+        )
+        x += 20 + 6.5 * len(words)
     return Markup("".join([*parts, "</svg>"]))
 
 

@@ -27,6 +27,7 @@ def render_history(book: Logbook) -> str:
         first = book.load(entries[0].id)
         origin = entries[0].valid_from_ns
         days = np.array([(entry.valid_from_ns - origin) / 86400e9 for entry in entries])
+        latest = max([days[-1], *((v.begin_ns - origin) / 86400e9 for v in verdicts)])
         turned: dict[str, list[float]] = {name: [] for name in first.cameras}
         for entry in entries:
             differences = compare_calibrations(first, book.load(entry.id), [20.0])
@@ -34,7 +35,9 @@ def render_history(book: Logbook) -> str:
                 values.append(differences[name].rotation_deg if name in differences else float("nan"))
         series = []
         for colour, (name, values) in enumerate(turned.items()):
-            series.append(Series(name, days, np.array(values), colour))
+            # one calibration holds until the next, the last one still
+            until = np.append(np.repeat(days, 2)[1:], latest + 0.05 * (latest or 1.0))
+            series.append(Series(name, until, np.repeat(values, 2), colour))
             said = [v for v in verdicts if v.camera == name and v.size_deg is not None]
             if said:
                 at = np.array([(v.begin_ns - origin) / 86400e9 for v in said])
@@ -48,6 +51,7 @@ def render_history(book: Logbook) -> str:
         card("Calibrations", table("Calibrations", ["number", "from", "to", "note"], rows, words=(3,)))
     )
     rows = [[_time(v.begin_ns), v.recording, v.camera, v.state, v.words] for v in verdicts]
+    rows = rows or [["", "", "", "", "nothing yet: rigwake monitor --log"]]
     head = ["from", "recording", "camera", "state", "words"]
     parts.append(card("What the monitor said", table("What the monitor said", head, rows, words=(4,))))
     return html_page(f"Logbook {book.path.name}", parts)

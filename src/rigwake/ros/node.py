@@ -11,16 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from rigwake.calibration import Calibration, load_calibration
+from rigwake.calibration import load_calibration
 from rigwake.errors import HostError, RigwakeError
 from rigwake.readers.ros_frames import IMAGE_TYPES
 from rigwake.readers.ros_recording import is_read, names_in_role
 from rigwake.readers.topics import camera_base
 from rigwake.ros.child_command import ChildCommand
+from rigwake.ros.node_outputs import camera_states, static_edges
 from rigwake.ros.recorder import BagRecorder, OpeningMessages, is_sent_once
 from rigwake.ros.topic_watch import TopicWatch
 from rigwake.ros.transport import (
@@ -42,7 +41,6 @@ SURROUND = "surround"
 _JUMP_NS = 1_000_000_000  # the clock ran back: a new bag begins
 _DISCOVER_EVERY_S = 2.0
 _STATUS_EVERY_S = 1.0
-_STATE_LEVELS = {"OK": StatusLevel.OK, "DRIFTED": StatusLevel.ERROR}
 
 
 @dataclass(frozen=True)
@@ -140,7 +138,10 @@ class RigwakeNode:
         self._jumps += 1
         if self._recorder is not None:
             self._close_bag()
-            self._open_bag()
+            try:
+                self._open_bag()
+            except (RigwakeError, OSError) as error:  # said on /diagnostics; messages go on coming
+                self._recording_fault = str(error)
         if self._piece is not None:
             self._drop_piece()
 
@@ -171,10 +172,13 @@ class RigwakeNode:
                 return False, self._recording_fault or "nothing was recorded: call ~record first"
             out = self._bag.with_name(self._bag.stem + "_calibration")
             words = ["calibrate", str(self._bag), "-o", str(out), "--force", *self._options.calibrate_words]
+            try:
+                self._calibrating = ChildCommand(
+                    words, lambda code, said: self._calibrated(out, code, said), self._options.program
+                )
+            except OSError as error:
+                return False, f"the process that calibrates cannot be started: {error}"
             self._said = NodeStatus("calibration", StatusLevel.OK, f"calibrating {self._bag.name}")
-            self._calibrating = ChildCommand(
-                words, lambda code, said: self._calibrated(out, code, said), self._options.program
-            )
             return True, f"calibrating {self._bag}; progress is on /diagnostics, the result goes to {out}"
 
     def _calibrated(self, out: Path, code: int, words: str) -> None:
@@ -374,22 +378,3 @@ def chosen_topics(known: dict[str, str], only: Sequence[str]) -> dict[str, str]:
         for topic, kind in sensors.items()
         if not (kind == IMAGE and camera_base(topic) in packed) and "/compressedDepth" not in topic
     }
-
-
-def static_edges(calibration: Calibration, child_frame: str) -> dict[tuple[str, str], Any]:
-    """`rig_from_cam` by (reference, camera's frame), of the cameras of which all is known."""
-    return {
-        (calibration.reference, child_frame.replace("{name}", name)): camera.rig_from_cam
-        for name, camera in calibration.cameras.items()
-        if np.isfinite(camera.rig_from_cam.matrix).all()
-    }
-
-
-def camera_states(answer: dict[str, Any]) -> list[NodeStatus]:
-    """What `rigwake monitor --json` says of every camera."""
-    entries = []
-    for name, verdict in answer["cameras"].items():
-        state = str(verdict["state"])
-        level = _STATE_LEVELS.get(state, StatusLevel.WARN)
-        entries.append(NodeStatus(f"camera {name}", level, f"{state}: {verdict['words']}", {"state": state}))
-    return entries

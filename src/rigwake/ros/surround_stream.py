@@ -152,6 +152,9 @@ class SurroundStream(threading.Thread):
                 self._draw(painter, kept, begun)
             except (RigwakeError, OSError) as error:
                 self.status = NodeStatus("surround", StatusLevel.ERROR, str(error))
+            except Exception as error:  # whatever a picture holds, the next one is tried
+                words = f"a fault of the program, please report it: {type(error).__name__}: {error}"
+                self.status = NodeStatus("surround", StatusLevel.ERROR, words)
             self._stopped.wait(max(self._period_s - (time.monotonic() - begun), 0.0))
 
     def _draw(
