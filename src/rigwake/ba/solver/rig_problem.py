@@ -242,7 +242,7 @@ class PoseMeasurements:
 
 @dataclass(frozen=True, eq=False)
 class RelativeMeasurements:
-    """Measured motion between two states as another body on the rig felt it.
+    """Measured motion between two states by another body on the rig.
 
     body_from_body: (n) transforms `body(from)_from_body(to)`, covariances (n, 6, 6), of the camera with this
     index, or of the rig itself for `camera_index` -1.
