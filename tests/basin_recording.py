@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -68,8 +69,13 @@ class BasinPictures:
                 int(index), int(self.timestamps_ns[index]), np.dstack([image] * 3) if colour else image
             )
 
+    @cached_property
+    def rays(self) -> tuple[Array, NDArray[np.bool_]]:
+        """One bearing per pixel, and which pixels the lens reaches."""
+        return self.model.unproject(pixel_grid(*SIZE))
+
     def _image(self, index: int) -> Image:
-        bearings, valid = self.model.unproject(pixel_grid(*SIZE))
+        bearings, valid = self.rays
         ray = np.nan_to_num(bearings, nan=0.5) @ self.world_from_cam.rotation[index].T
         origin = self.world_from_cam.translation[index] - self.centre_world
         a = np.maximum(ray[:, 0] ** 2 + ray[:, 1] ** 2, 1e-9)

@@ -50,10 +50,8 @@ def test_a_tape_measure_knows_better(calm: SimulatedTracks) -> None:
     problem = assembled(calm).problem
     high = SE3(np.eye(3), np.array([0.0, 0.0, 3.0]))
     tape = PosePrior.in_axes_of_a(high, [np.inf] * 5 + [0.02])
-    known_fraction = replace(
-        problem, cameras=tuple(replace(c, rig_from_cam_prior=tape) for c in problem.cameras)
-    )
-    assert [c.rig_from_cam_prior for c in with_height_prior(known_fraction).cameras] == [tape, tape]
+    known = replace(problem, cameras=tuple(replace(c, rig_from_cam_prior=tape) for c in problem.cameras))
+    assert [c.rig_from_cam_prior for c in with_height_prior(known).cameras] == [tape, tape]
 
 
 def test_rounding_does_not_open_what_cancels(calm: SimulatedTracks) -> None:

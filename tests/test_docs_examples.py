@@ -4,6 +4,7 @@ import ast
 import re
 import runpy
 import shlex
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -68,15 +69,24 @@ def test_a_notebook_shows_a_table_without_made_up_numbers() -> None:
     assert "nan" not in rig._repr_html_() + repr(rig)
 
 
+@cache
+def syntax_of_package() -> list[ast.AST]:
+    """Strings and raised errors of the whole package."""
+    kinds = (ast.JoinedStr, ast.Constant, ast.Raise)
+    files = (ROOT / "src" / "rigwake").rglob("*.py")
+    return [
+        node for path in files for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, kinds)
+    ]
+
+
 def source_text() -> str:
     """All string literals of the package, adjacent ones joined, what is inserted left out."""
     literals = []
-    for path in (ROOT / "src" / "rigwake").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.JoinedStr):
-                literals += [part.value for part in node.values if isinstance(part, ast.Constant)]
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                literals.append(node.value)
+    for node in syntax_of_package():
+        if isinstance(node, ast.JoinedStr):
+            literals += [part.value for part in node.values if isinstance(part, ast.Constant)]
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            literals.append(node.value)
     return "\n".join(literals)
 
 
@@ -94,13 +104,12 @@ def test_messages_in_the_faq_are_messages_of_the_program() -> None:
 def causes_of(error: str) -> list[list[str]]:
     """The words, without what is inserted, of every cause that is raised as this error."""
     found = []
-    for path in (ROOT / "src" / "rigwake").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            raised = node.exc if isinstance(node, ast.Raise) else None
-            if isinstance(raised, ast.Call) and raised.args and ast.unparse(raised.func) == error:
-                parts = [n for n in ast.walk(raised.args[0]) if isinstance(n, ast.Constant)]
-                words = [str(part.value).strip() for part in parts]
-                found.append([text for text in words if len(text.split()) >= 2])
+    for node in syntax_of_package():
+        raised = node.exc if isinstance(node, ast.Raise) else None
+        if isinstance(raised, ast.Call) and raised.args and ast.unparse(raised.func) == error:
+            parts = [n for n in ast.walk(raised.args[0]) if isinstance(n, ast.Constant)]
+            words = [str(part.value).strip() for part in parts]
+            found.append([text for text in words if len(text.split()) >= 2])
     return found
 
 
@@ -220,7 +229,9 @@ def test_commands_in_the_documentation_exist() -> None:
 
 
 def test_every_page_is_in_the_site_and_linked_from_its_start() -> None:
-    pages = {page.name for page in (ROOT / "docs").glob("*.md")}
+    docs = ROOT / "docs"
+    pages = {page.relative_to(docs).as_posix() for page in docs.rglob("*.md")}
     assert pages == set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text()))
-    linked = set(re.findall(r"\]\((\w+\.md)\)", (ROOT / "docs" / "index.md").read_text()))
-    assert pages - linked == {"index.md"}
+    linked = set(re.findall(r"\]\(([\w/]+\.md)\)", (docs / "index.md").read_text()))
+    assert {page for page in pages if "/" not in page} - linked == {"index.md"}
+    assert {"reference/api.md", "measurements/index.md"} <= linked  # the ways to pages made by programs

@@ -12,6 +12,7 @@ LAYERS = [
     [
         "errors",
         "_progress",
+        "_tables",
         "_types",
         "atomic",
         "fingerprint",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,7 @@ from rigwake.handeye.motions import (
     steps_between,
 )
 from rigwake.handeye.noise import noise_over_steps
+from rigwake.monitor.change_detection import fit_change
 from rigwake.odometry.gyro import align_gyro
 from rigwake.odometry.imu_alignment import align_inertial
 from rigwake.odometry.metric import metric_start
@@ -488,6 +490,26 @@ class TestReportNumbers:
         rotation = np.stack([right, [0.0, 0.0, -1.0], ahead], axis=1)
         camera = rig_camera("a", SE3(rotation, np.zeros(3)), np.eye(6) * 1e-6, 0.0)
         assert looks(camera, "imu").startswith("28.6° left of x, level")
+
+
+class TestMonitor:
+    def test_a_weak_step_is_not_called_a_ramp(self) -> None:
+        """A ramp has to explain more than a step by six; here all of the step's evidence is five."""
+        blocks, begin, step = 20, 12, np.array([0.0, 0.01, 0.0])
+        information = 2 * 5.0 / ((blocks - begin) * step @ step)
+        after = (np.arange(blocks) >= begin)[:, None]
+        scores = SimpleNamespace(
+            cameras=("front",),
+            columns=lambda _: slice(0, 3),
+            inflation=np.ones((blocks, 1)),
+            H=np.tile(information * np.eye(3), (blocks, 1, 1)),
+            g=after * information * step,
+        )
+        found: Any = SimpleNamespace(scores=scores, belief=SimpleNamespace(covariance=1e-12 * np.eye(3)))
+        change = fit_change(found, 0, blocks - 1)
+        assert (change.kind, change.block) == ("step", begin)
+        np.testing.assert_allclose(change.rotation, step, rtol=0.02)
+        assert change.evidence == pytest.approx(5.0, rel=0.02)
 
 
 class TestTrajectoryFiles:

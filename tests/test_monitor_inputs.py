@@ -98,6 +98,7 @@ def test_numbers_that_the_calibration_lacks(world: Watch) -> None:
     assert np.isfinite(prepared.rig.cameras["front"].rig_from_cam.translation).all()
 
 
+@pytest.mark.slow
 def test_from_alarm_to_new_calibration_and_logbook(world: Watch, tmp_path: Path) -> None:
     result = monitor(world.calibration, world.recording, tracks=world.tracks)
     assert result.blamed == ("left",)

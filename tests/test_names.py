@@ -26,7 +26,7 @@ OLD_WORDS = {
     r"hand(ed|ing)?[- _]over": "cross-camera association",
     r"HandOver": "CrossCameraMatches",
     r"promise[ds]?": "assumed, predicted",
-    r"doubt(s|ful)?": "uncertainty",
+    r"doubt(s|ful|ed|ed_at)?": "uncertainty, suspected",
     r"feign(s|ed)?": "spurious",
     r"foreign(?!_keys)": "external",
     r"kept[- _]back": "held-out",

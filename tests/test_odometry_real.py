@@ -84,6 +84,7 @@ def test_a_car_keeps_its_scale_through_a_turn(real_recordings):
     assert np.rad2deg(drift) < 0.25 * truth.path_length / 100
 
 
+@pytest.mark.slow
 def test_a_drone_that_stands_still_keeps_its_attitude_and_claims_no_path(real_recordings, tmp_path):
     folder = real_recordings / "euroc_v101_micro"
     arguments = ["odometry", str(folder), "--camera", "cam0", "--no-hull", "--no-horizon"]

@@ -6,7 +6,26 @@ from hypothesis import strategies as st
 
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.geometry.triangulation import triangulate_dlt, triangulate_midpoint, triangulate_rays
+from rigwake.geometry.triangulation import triangulate_midpoint, triangulate_rays
+
+
+def triangulate_dlt(
+    second_from_first: SE3, bearings_first: np.ndarray, bearings_second: np.ndarray
+) -> np.ndarray:
+    """Linear two-view triangulation: the null vector of `[b1]x X = 0, [b2]x (R X + t) = 0`.
+
+    Hartley and Zisserman 12.2, with bearings for pixels. (N, 3), (N, 3) -> points in the first camera's frame (N, 3).
+    """
+    first_from_first = SE3.identity()
+    rows = []
+    for cam_from_first, bearings in (
+        (first_from_first, bearings_first),
+        (second_from_first, bearings_second),
+    ):
+        projection = np.column_stack([cam_from_first.rotation, cam_from_first.translation])
+        rows.append(np.einsum("nij,jk->nik", so3.hat(bearings), projection))
+    homogeneous = np.linalg.svd(np.concatenate(rows, axis=1))[2][:, -1]
+    return np.asarray(homogeneous[:, :3] / homogeneous[:, 3:])
 
 
 def unit(v: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._tables import take_rows
 from rigwake._types import Array, Indices
 from rigwake.atomic import atomic_path
 from rigwake.errors import InputError
@@ -66,16 +67,7 @@ class Tracks:
 
     def take(self, index: Indices | NDArray[np.bool_]) -> Tracks:
         """The chosen observations."""
-        return Tracks(
-            self.camera,
-            self.timestamps_ns,
-            self.frame_indices[index],
-            self.track_ids[index],
-            self.pixels[index],
-            self.bearings_cam[index],
-            self.std_px[index],
-            self.report,
-        )
+        return take_rows(self, index, keep=("camera", "timestamps_ns", "report"))
 
     def save(self, path: Path) -> None:
         """Write a compressed .npz, whole or not at all."""

@@ -36,29 +36,6 @@ class Triangulated:
         return good & (self.max_parallax >= min_parallax) & (self.rms_angle <= max_rms_angle)
 
 
-def triangulate_dlt(second_from_first: SE3, bearings_first: Array, bearings_second: Array) -> Array:
-    """Linear two-view triangulation: the null vector of `[b1]x X = 0, [b2]x (R X + t) = 0`.
-
-    Hartley and Zisserman 12.2, with bearings for pixels. (N, 3), (N, 3) -> points in the first camera's frame (N, 3).
-    """
-    first_from_first = SE3.identity()
-    rows = []
-    for cam_from_first, bearings in (
-        (first_from_first, bearings_first),
-        (second_from_first, bearings_second),
-    ):
-        projection = np.column_stack([cam_from_first.rotation, cam_from_first.translation])
-        rows.append(np.einsum("nij,jk->nik", _hat(bearings), projection))
-    homogeneous = np.linalg.svd(np.concatenate(rows, axis=1))[2][:, -1]
-    return np.asarray(homogeneous[:, :3] / homogeneous[:, 3:])
-
-
-def _hat(v: Array) -> Array:
-    zero = np.zeros(len(v))
-    x, y, z = v.T
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
-
-
 def triangulate_midpoint(second_from_first: SE3, bearings_first: Array, bearings_second: Array) -> Array:
     """The points nearest to both rays, in the first camera's frame: (N, 3), (N, 3) -> (N, 3)."""
     first_from_second = second_from_first.inverse()

@@ -44,11 +44,6 @@ class BoardObservations:
         views = tuple(self.views[int(i)] for i in indices)
         return BoardObservations(self.width_px, self.height_px, views, self.unused)
 
-    @property
-    def corner_count(self) -> int:
-        """Corners in all views."""
-        return sum(len(view) for view in self.views)
-
 
 def read_corner_file(path: Path | str, width_px: int, height_px: int) -> BoardObservations:
     """Corners that another detector found, one view per timestamp.

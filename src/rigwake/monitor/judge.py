@@ -226,7 +226,7 @@ def _standings(
 ) -> tuple[tuple[CameraState, ...], ...]:
     standing = {name: Standing() for name in names}
     blamed_at = {alarm.camera: alarm.block for alarm in alarms if alarm.camera}
-    doubted_at = {alarm.explanations[0].camera: alarm.block for alarm in alarms if not alarm.camera}
+    suspected_at = {alarm.explanations[0].camera: alarm.block for alarm in alarms if not alarm.camera}
     # beside a bent picture nothing can be told of the others from these scores
     bent_at = min(
         (a.block for a in alarms if a.explanations[0].cause == "picture"), default=len(statistics.value)
@@ -238,10 +238,10 @@ def _standings(
             blamed = name in blamed_at and k >= blamed_at[name]
             if blamed and k == blamed_at[name]:
                 value = max(value, thresholds.alarm)
-            doubted = (name in doubted_at and k >= doubted_at[name]) or (
-                "" in doubted_at and k >= doubted_at[""]
+            suspected = (name in suspected_at and k >= suspected_at[name]) or (
+                "" in suspected_at and k >= suspected_at[""]
             )
-            if doubted and not blamed:
+            if suspected and not blamed:
                 value = max(value, thresholds.suspect)
             elif k >= bent_at - 1 and not blamed:
                 value = 0.0

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from rigwake._robust import MAD_TO_STD
+from rigwake._tables import take_rows
 from rigwake._types import Array, Indices
 from rigwake.monitor.frame_pairs import EpipolarPairs, pair_frames
 from rigwake.monitor.pair_kernels import COLUMNS, MOUNTING, accumulate, pair_residuals, sum_by
@@ -83,20 +84,7 @@ class BlockScores:
 
     def take(self, index: slice | NDArray[np.int64]) -> BlockScores:
         """The chosen blocks."""
-        return BlockScores(
-            self.cameras,
-            self.starts_ns[index],
-            self.H[index],
-            self.g[index],
-            self.inflation[index],
-            self.noise[index],
-            self.rows[index],
-            self.speed[index],
-            self.turning[index],
-            self.gravity[index],
-            self.sectors[index],
-            self.bias[index],
-        )
+        return take_rows(self, index, keep=("cameras",))
 
 
 def join_blocks(parts: list[BlockScores]) -> BlockScores:

@@ -91,7 +91,7 @@ def check_clocks(fits: Mapping[str, TurnFit]) -> tuple[SensorCheck, ...]:
 class MountChange:
     """A camera that sat otherwise before than after: when (its own clock), and both `imu_from_cam` (3, 3).
 
-    std: of the angle between both. felt: the turn that the camera saw then and the gyroscope did not, radians, or None
+    std: of the angle between both. knock: the turn that the camera saw then and the gyroscope did not, radians, or None
     where no single stride shows it.
     """
 
@@ -99,7 +99,7 @@ class MountChange:
     before: Array
     after: Array
     std: float
-    coupling: float | None = None
+    knock: float | None = None
 
     @property
     def turned(self) -> float:
@@ -121,9 +121,9 @@ def mount_change(fit: TurnFit) -> MountChange | None:
     knocks = []
     for k in np.flatnonzero(sizes > max(_TURNED, 10 * fit.rms)).tolist():
         if _FEWEST <= k < n - _FEWEST and _stays(fit, gyro, k):
-            knocks.append(replace(_split(fit, gyro, k, 1), coupling=float(sizes[k])))
+            knocks.append(replace(_split(fit, gyro, k, 1), knock=float(sizes[k])))
     if knocks:
-        return max(knocks, key=lambda found: found.coupling or 0.0)
+        return max(knocks, key=lambda found: found.knock or 0.0)
     costs = [
         _misfit(turns[:k], gyro[:k], fit.rms) + _misfit(turns[k:], gyro[k:], fit.rms)
         for k in range(_FEWEST, n - _FEWEST + 1)
@@ -206,7 +206,7 @@ def check_mounts(fits: Mapping[str, TurnFit]) -> tuple[SensorCheck, ...]:
             )
             remedy = "Calibrate the part before or after (--start, --duration)."
         else:
-            size = size if change.coupling is None else np.rad2deg(change.coupling)
+            size = size if change.knock is None else np.rad2deg(change.knock)
             words = f"it was knocked at {at:.1f} s: its mount turned by {size:.2f} deg."
             remedy = "Fix its mount; calibrate the part before or after (--start, --duration)."
         checks.append(

@@ -53,12 +53,6 @@ def with_noise_settings(imu: ImuStream, settings: Any, where: str) -> tuple[ImuS
     return replace(imu, **known), findings
 
 
-def noise_settings(imu: ImuStream) -> dict[str, float]:
-    """What a file would say of an IMU's noise: its known densities by name."""
-    names = sorted(set(_FIELDS.values()))
-    return {name: float(getattr(imu, name)) for name in names if getattr(imu, name) is not None}
-
-
 def _positive(value: Any, where: str) -> float:
     try:
         number = float(value) if not isinstance(value, bool) else -1.0  # YAML reads 2e-4 as text

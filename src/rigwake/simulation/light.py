@@ -15,7 +15,6 @@ from rigwake.simulation.meshes import Mesh
 from rigwake.simulation.scenario import Weather
 from rigwake.simulation.textures import noise
 
-SUN_RADIANCE = 60.0  # of the (widened) disc; the sky is about 1
 SUN_COLOUR = np.array([1.0, 0.93, 0.8])
 SUN_IRRADIANCE = 2.6
 SKY_WIDTH, SKY_HEIGHT = 1536, 320

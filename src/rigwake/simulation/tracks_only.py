@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._tables import take_rows
 from rigwake._types import Array
 from rigwake.geometry.se3 import SE3
 from rigwake.recording import Frame, Recording
@@ -68,7 +69,7 @@ class _Sightings:
     pixels: Array
 
     def take(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> _Sightings:
-        return _Sightings(self.frame[index], self.track[index], self.landmark[index], self.pixels[index])
+        return take_rows(self, index)
 
 
 def simulate_tracks(scenario: Scenario) -> SimulatedTracks:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._tables import join_rows, take_rows
 from rigwake._types import Array, Image, Mask
 from rigwake.cameras.protocol import CameraModel
 from rigwake.tracking.features import detect_corners
@@ -60,18 +60,10 @@ class _Live:
     gate_ratios: Array
 
     def take(self, index: Mask | NDArray[np.int64]) -> _Live:
-        return _Live(*(_taken(getattr(self, f.name), index) for f in fields(self)))
+        return take_rows(self, index)
 
     def join(self, other: _Live) -> _Live:
-        return _Live(*(_joined(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)))
-
-
-def _taken(value: Any, index: Any) -> Any:
-    return value.take(index) if isinstance(value, References) else value[index]
-
-
-def _joined(first: Any, second: Any) -> Any:
-    return first.join(second) if isinstance(first, References) else np.concatenate([first, second])
+        return join_rows([self, other])
 
 
 def reduced_options(options: TrackingOptions, factor: int) -> TrackingOptions:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._tables import take_rows
 from rigwake._types import Array, Image, Mask
 from rigwake.errors import UsageError
 from rigwake.tracking.features import balanced
@@ -31,7 +32,7 @@ class Keypoints:
 
     def take(self, index: NDArray[np.int64]) -> Keypoints:
         """The chosen keypoints."""
-        return Keypoints(self.pixels[index], self.scales[index], self.descriptors[index])
+        return take_rows(self, index)
 
 
 Detector = Callable[[Image, Mask], Keypoints]

@@ -6,7 +6,7 @@ directions (gain and bias, each varying linearly over the patch) projected out o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
@@ -14,6 +14,7 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from rigwake._tables import join_rows, take_rows
 from rigwake._types import Array, Floats, Mask
 from rigwake.tracking.interpolation import Coefficients, sample_with_gradient
 from rigwake.tracking.small_solve import cholesky_solve
@@ -80,13 +81,11 @@ class References:
 
     def take(self, index: Mask) -> References:
         """The chosen patches."""
-        return References(*(getattr(self, f.name)[index] for f in fields(self)))
+        return take_rows(self, index)
 
     def join(self, other: References) -> References:
         """These patches, then the other ones."""
-        return References(
-            *(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self))
-        )
+        return join_rows([self, other])
 
 
 def make_references(coefficients: Coefficients, pixels: Array, shape: PatchShape) -> tuple[References, Mask]:

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._tables import join_rows
 from rigwake._types import Array, Floats, Image
 from rigwake.views.attitude import LevelAttitude
 from rigwake.views.strips import StripGrid, camera_strips
@@ -72,8 +73,7 @@ class ColourSamples:
     @classmethod
     def joined(cls, parts: Sequence[ColourSamples]) -> ColourSamples:
         """All samples of several frame sets."""
-        names = ("first", "second", "log_ratio", "s_first", "s_second")
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        return join_rows(parts)
 
 
 def colour_samples(

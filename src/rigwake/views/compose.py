@@ -15,8 +15,6 @@ from rigwake._types import Floats, Image
 from rigwake.parallel import over_ranges, ranges
 from rigwake.views.lookup import STEP, CoarseLookup
 
-_ONE = 1 << 16
-
 
 def compose(
     stack: NDArray[np.uint8],

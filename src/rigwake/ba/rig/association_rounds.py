@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigwake._robust import MAD_TO_STD
+from rigwake._tables import join_rows
 from rigwake._types import Mask
 from rigwake.ba.rig.association import find_landmarks
 from rigwake.ba.rig.height_prior import restore_priors, with_height_prior
@@ -39,9 +40,7 @@ class CrossCameraMatches:
 
 def joined(first: Observations, second: Observations) -> Observations:
     """These observations, then those."""
-    return Observations(
-        *(np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(Observations))
-    )
+    return join_rows([first, second])
 
 
 def adjust_with_association(

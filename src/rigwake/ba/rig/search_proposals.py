@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from rigwake._tables import take_rows
 from rigwake._types import Array, Indices, Mask
 from rigwake.ba.solver.rig_problem import Observations, RigProblem
 from rigwake.errors import UsageError
@@ -80,7 +81,7 @@ class Searches:
 
     def take(self, index: Indices | Mask) -> Searches:
         """The chosen searches."""
-        return Searches(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+        return take_rows(self, index)
 
 
 def camera_from_world(problem: RigProblem, camera: int, stamps: Indices) -> SE3:

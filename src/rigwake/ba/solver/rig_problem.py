@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigwake._tables import take_rows
 from rigwake._types import Array, Indices, Mask
 from rigwake.ba.solver.robust_loss import Loss
 from rigwake.cameras.protocol import CameraModel
@@ -152,7 +153,7 @@ class Landmarks:
 
     def take(self, index: Indices | Mask) -> Landmarks:
         """The chosen landmarks."""
-        return Landmarks(self.anchors_world[index], self.bearings_world[index], self.inverse_ranges[index])
+        return take_rows(self, index)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,13 +181,7 @@ class Observations:
 
     def take(self, index: Indices | Mask) -> Observations:
         """The chosen observations."""
-        return Observations(
-            self.camera_indices[index],
-            self.timestamps_ns[index],
-            self.landmark_indices[index],
-            self.pixels[index],
-            self.std_px[index],
-        )
+        return take_rows(self, index)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +242,7 @@ class PoseMeasurements:
 
 @dataclass(frozen=True, eq=False)
 class RelativeMeasurements:
-    """Measured motion between two states as another body on the rig felt it.
+    """Measured motion between two states by another body on the rig.
 
     body_from_body: (n) transforms `body(from)_from_body(to)`, covariances (n, 6, 6), of the camera with this
     index, or of the rig itself for `camera_index` -1.

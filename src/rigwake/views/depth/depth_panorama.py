@@ -55,23 +55,6 @@ class DepthPanorama:
         return WaterAndDepth(self.range_m, float(top), float(step), shell_m)
 
 
-def measure_depth(
-    images: Mapping[str, Image],
-    rig: SurroundRig,
-    attitude: LevelAttitude,
-    labels: Labels,
-    grid: StripGrid,
-    masks: Mapping[str, Mask] | None = None,
-    nearest_m: float = 3.0,
-    timestamp_ns: int = 0,
-) -> DepthPanorama:
-    """Ranges of one frame set. labels: of its level strip: only obstacles are matched; the mirrored shore in the water
-    would be matched just as well, and be wrong."""
-    return fuse_depth(
-        matched_points(images, rig, attitude, masks, nearest_m), labels, grid, attitude, timestamp_ns
-    )
-
-
 def matched_points(
     images: Mapping[str, Image],
     rig: SurroundRig,
