@@ -12,9 +12,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from rigwake._types import Array
-from rigwake.ba.rig.intrinsics_refinement import IntrinsicsWidth
+from rigwake.ba.rig.intrinsics_refinement import (
+    FROM_A_FILE,
+    IntrinsicsWidth,
+    LensBelief,
+    intrinsics_prior,
+    moved_px,
+)
 from rigwake.cameras.moved_lens import moved_lens
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import RigwakeError
@@ -35,19 +42,23 @@ DISBELIEVED = IntrinsicsWidth(focal=0.02, centre_px=10.0, distortion=0.1, aspect
 
 _ROUNDS = 3
 _FARTHEST_SCALE, _FARTHEST_SHIFT = 0.1, 0.08  # a lens further off (centre: of the width) is another camera's
+_AGAIN_PX = 2.0  # RMS: what was made with a lens so far off is made again
+_UNLIKELY = 1e-3
 _HARDLY = 0.002  # a scale nearer to one is not worth another round
 
 
 @dataclass(frozen=True, eq=False)
 class MendedLenses:
     """What takes part, with better lenses. fits: of the lenses as they are now; None where they were not looked at.
-    moved: by camera, those that were moved. checks: what was wrong with them, and what was done."""
+    beliefs: by camera, the priors of those that are not as given; moved: which of them tracks or gyroscope contradict.
+    checks: what was wrong with them, and what was done."""
 
     selection: Selection
     tracks: Mapping[str, Tracks]
     trajectories: Mapping[str, Trajectory]
     fits: Mapping[str, LensFit] | None = None
-    moved: Mapping[str, IntrinsicsWidth] = field(default_factory=dict)
+    beliefs: Mapping[str, LensBelief] = field(default_factory=dict)
+    moved: frozenset[str] = frozenset()
     checks: tuple[SensorCheck, ...] = ()
 
 
@@ -86,21 +97,78 @@ def mend_lenses(
         moved = _moved(cameras[name], scale, np.zeros(2), odometry)
         if moved is not None:
             cameras[name] = moved
-            fits |= _fit(name, moved)
-    widths = {name: DISBELIEVED for name, camera in cameras.items() if camera.lens is not given[name]}
+    moved_now = frozenset(name for name, camera in cameras.items() if camera.lens is not given[name])
+    # nor is what a board told of it believed
     streams = {
-        name: replace(stream, model=cameras[name].lens, intrinsics_covariance=None)
-        if name in widths
-        else stream
+        name: replace(stream, intrinsics_covariance=None) if name in moved_now else stream
         for name, stream in selection.cameras.items()
     }
-    return MendedLenses(
-        replace(selection, cameras=streams),
-        {name: cameras[name].tracks if name in cameras else own for name, own in tracks.items()},
-        {name: cameras[name].trajectory if name in cameras else own for name, own in trajectories.items()},
-        fits,
-        widths,
-        tuple(_check(name, given[name], cameras[name].lens) for name in widths),
+    start = MendedLenses(replace(selection, cameras=streams), tracks, trajectories)
+    found = _with_cameras(start, cameras, moved_now)
+    return replace(
+        found,
+        # what is left of a lens that was moved is for the rig to mend
+        fits={name: fit for name, fit in fits.items() if name not in moved_now},
+        beliefs={name: LensBelief(cameras[name].lens, DISBELIEVED) for name in moved_now},
+        moved=moved_now,
+        checks=tuple(_check(name, given[name], cameras[name].lens) for name in sorted(moved_now)),
+    )
+
+
+def started_from(
+    mended: MendedLenses, lenses: Mapping[str, CameraModel], odometry: OdometryOptions | None
+) -> MendedLenses:
+    """The same with lenses that the rig moved by pixels: bearings and trajectories by them, priors as they were.
+
+    lenses: refined, by camera. `mended` itself where all moved little.
+    """
+    cameras = {}
+    for name, lens in lenses.items():
+        former, own = mended.selection.cameras[name].model, mended.tracks[name]
+        if former is not None and _rms_px(former, lens, own.pixels) > _AGAIN_PX:
+            again = _seen_by(lens, own, mended.trajectories[name], odometry)
+            if again is not None:
+                cameras[name] = again
+    if not cameras and not mended.moved:
+        return mended
+    beliefs = {}
+    for name, camera in cameras.items():
+        former = mended.selection.cameras[name].model
+        if former is not None:
+            doubted = _contradicts(former, camera.lens, camera.tracks.pixels)
+            beliefs[name] = LensBelief(former, DISBELIEVED if doubted else FROM_A_FILE)
+    found = _with_cameras(mended, cameras, frozenset(cameras))
+    models = {n: m for n in found.trajectories if (m := found.selection.cameras[n].model) is not None}
+    fits = fit_lenses(found.tracks, models, found.trajectories)
+    return replace(found, beliefs={**beliefs, **mended.beliefs}, fits=fits)
+
+
+def _contradicts(believed: CameraModel, found: CameraModel, pixels: Array) -> bool:
+    """Whether a lens is too far from the one believed for its prior to have been right."""
+    prior = intrinsics_prior(believed, pixels)
+    moved = found.params - prior.mean
+    return bool(moved @ prior.information @ moved > chi2.isf(_UNLIKELY, len(moved)))
+
+
+def _rms_px(before: CameraModel, after: CameraModel, pixels: Array) -> float:
+    moved = np.linalg.norm(moved_px(before, after, pixels), axis=1)
+    moved = moved[np.isfinite(moved)]
+    return float(np.sqrt(np.mean(moved**2))) if len(moved) else 0.0
+
+
+def _with_cameras(
+    mended: MendedLenses, cameras: Mapping[str, _Camera], changed: frozenset[str]
+) -> MendedLenses:
+    """With the lenses, tracks and trajectories of the cameras that changed."""
+    streams = {
+        name: replace(stream, model=cameras[name].lens) if name in changed else stream
+        for name, stream in mended.selection.cameras.items()
+    }
+    return replace(
+        mended,
+        selection=replace(mended.selection, cameras=streams),
+        tracks={**mended.tracks, **{name: cameras[name].tracks for name in changed}},
+        trajectories={**mended.trajectories, **{name: cameras[name].trajectory for name in changed}},
     )
 
 
@@ -159,13 +227,22 @@ def _moved(
     """The camera with a moved lens, bearings and trajectory by it; None where that cannot be."""
     try:
         lens = moved_lens(camera.lens, scale, shift_px)
-        bearings, seen = lens.unproject(camera.tracks.pixels)
-        tracks = replace(camera.tracks, bearings_cam=bearings).take(np.flatnonzero(seen))
-        if odometry is None:
-            return _Camera(lens, tracks, camera.trajectory)
-        return _Camera(lens, tracks, estimate_monocular(tracks, lens, odometry).trajectory)
     except RigwakeError:
         return None
+    return _seen_by(lens, camera.tracks, camera.trajectory, odometry)
+
+
+def _seen_by(
+    lens: CameraModel, tracks: Tracks, trajectory: Trajectory, odometry: OdometryOptions | None
+) -> _Camera | None:
+    """Bearings and trajectory by this lens; None where there is no trajectory."""
+    bearings, seen = lens.unproject(tracks.pixels)
+    tracks = replace(tracks, bearings_cam=bearings).take(np.flatnonzero(seen))
+    try:
+        found = trajectory if odometry is None else estimate_monocular(tracks, lens, odometry).trajectory
+    except RigwakeError:
+        return None
+    return _Camera(lens, tracks, found)
 
 
 def _is_far(given: CameraModel, lens: CameraModel) -> bool:

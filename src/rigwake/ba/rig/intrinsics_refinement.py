@@ -105,18 +105,27 @@ def _stds(model: CameraModel, pixels: Array, width: IntrinsicsWidth) -> Array:
     return std
 
 
-def with_free_intrinsics(
-    problem: RigProblem, covariances: Mapping[str, Array], widths: Mapping[str, IntrinsicsWidth] | None = None
-) -> RigProblem:
-    """The problem with the intrinsics of every camera free, about those that it has.
+@dataclass(frozen=True, eq=False)
+class LensBelief:
+    """The lens that a prior is about, and how far it may be off."""
 
-    covariances: by camera, of those that a board calibrated. widths: by camera, where not `FROM_A_FILE`.
+    model: CameraModel
+    width: IntrinsicsWidth = FROM_A_FILE
+
+
+def with_free_intrinsics(
+    problem: RigProblem, covariances: Mapping[str, Array], beliefs: Mapping[str, LensBelief] | None = None
+) -> RigProblem:
+    """The problem with the intrinsics of every camera free.
+
+    covariances: by camera, of those that a board calibrated. beliefs: by camera, of those whose prior is not about
+    the lens that they have, or not as wide as `FROM_A_FILE`.
     """
     cameras = []
     for index, camera in enumerate(problem.cameras):
         pixels = problem.observations.pixels[problem.observations.camera_indices == index]
-        width = (widths or {}).get(camera.name, FROM_A_FILE)
-        prior = intrinsics_prior(camera.model, pixels, width, covariances.get(camera.name))
+        belief = (beliefs or {}).get(camera.name, LensBelief(camera.model))
+        prior = intrinsics_prior(belief.model, pixels, belief.width, covariances.get(camera.name))
         cameras.append(replace(camera, free=camera.free | {"intrinsics"}, intrinsics_prior=prior))
     return replace(problem, cameras=tuple(cameras))
 
