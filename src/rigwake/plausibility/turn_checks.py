@@ -15,6 +15,7 @@ from rigwake.plausibility.values import SensorCheck
 
 _EXPLAINED = 0.15
 _SCALE = 0.01
+_AGREED = 0.004  # spread of the scales that cameras ask for, to be one scale
 _SIGMAS = 6.0
 _DRIFT = 2.5e-4
 _TURNED = np.deg2rad(0.2)
@@ -34,7 +35,7 @@ def check_scale(
     if not known:
         return (), None
     middle = float(np.median([f.scale for f in known.values()]))
-    off = {n: f for n, f in known.items() if abs(f.scale - 1) > max(_SCALE, _SIGMAS * f.std[7])}
+    off = {n: f for n, f in known.items() if _is_off(f)}
     if len(off) * 2 <= len(known):
         checks = [SensorCheck("gyroscope", True, middle, 1.0, quantity=quantity)]
         checks += [_camera_scale(name, fit) for name, fit in off.items()]
@@ -46,14 +47,23 @@ def check_scale(
     )
     remedy = "Calibrate the gyroscope's scale, or check its unit and the rate that its stamps claim."
     check = SensorCheck("gyroscope", False, middle, 1.0, f"{words}.", remedy, quantity)
-    agreed = len(off) >= 2 and spread < 0.004 and abs(middle - 1) < 0.1
+    agreed = len(off) >= 2 and spread < _AGREED and abs(middle - 1) < 0.1
     return (check,), middle if agreed else None
 
 
 def scale_of_lenses(fits: Mapping[str, TurnFit], sound_lenses: frozenset[str]) -> dict[str, float]:
-    """By camera that `check_scale` finds wrong, its turns over the gyroscope's: so much longer its focal length is."""
-    wrong = {check.sensor for check in check_scale(fits, sound_lenses)[0] if not check.agrees}
-    return {name: fit.scale for name, fit in fits.items() if f"camera {name}" in wrong}
+    """By camera whose lens the gyroscope contradicts: its turns over the gyroscope's, by which its focal length is longer.
+
+    Only where several cameras agree that the gyroscope's scale is wrong, it is the gyroscope: none then.
+    """
+    known = {n: f for n, f in fits.items() if f.unexplained <= _EXPLAINED and n in sound_lenses}
+    off = {n: f.scale for n, f in known.items() if _is_off(f)}
+    agreed = len(off) >= 2 and max(off.values()) - min(off.values()) < 2 * _AGREED
+    return {} if agreed and len(off) * 2 > len(known) else off
+
+
+def _is_off(fit: TurnFit) -> bool:
+    return bool(abs(fit.scale - 1) > max(_SCALE, _SIGMAS * fit.std[7]))
 
 
 def _camera_scale(name: str, fit: TurnFit) -> SensorCheck:
