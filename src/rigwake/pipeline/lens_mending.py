@@ -44,6 +44,7 @@ _ROUNDS = 3
 _FARTHEST_SCALE, _FARTHEST_SHIFT = 0.1, 0.08  # a lens further off (centre: of the width) is another camera's
 _AGAIN_PX = 2.0  # RMS: what was made with a lens so far off is made again
 _UNLIKELY = 1e-3
+_SURE_SCALE = 0.004  # deviation
 _HARDLY = 0.002  # a scale nearer to one is not worth another round
 
 
@@ -93,10 +94,15 @@ def mend_lenses(
         cameras[name], fit = _by_own_tracks(name, camera, odometry)
         if fit is not None:
             fits[name] = fit
-    for name, scale in _by_gyroscope(selection.imu, cameras, fits).items():
+    as_given = frozenset(name for name, camera in cameras.items() if camera.lens is given[name])
+    for name, scale in _by_gyroscope(selection.imu, cameras, fits, as_given).items():
         moved = _moved(cameras[name], scale, np.zeros(2), odometry)
         if moved is not None:
             cameras[name] = moved
+    for name, camera in cameras.items():
+        if _is_far(given[name], camera.lens):  # another camera's
+            cameras[name] = _Camera(given[name], tracks[name], trajectories[name])
+            fits |= _fit(name, cameras[name])
     moved_now = frozenset(name for name, camera in cameras.items() if camera.lens is not given[name])
     # nor is what a board told of it believed
     streams = {
@@ -187,15 +193,14 @@ def refuse_contradicted(mended: MendedLenses, lenses: Mapping[str, CameraModel])
 def _by_own_tracks(
     name: str, camera: _Camera, odometry: OdometryOptions | None
 ) -> tuple[_Camera, LensFit | None]:
-    """The camera with its lens where pairs of its images want it, and the last fit; as it was where that fails."""
-    first, fit = camera, _fit(name, camera).get(name)
-    last = fit
+    """The camera with its lens where pairs of its images want it, and the last fit."""
+    last = _fit(name, camera).get(name)
     for _ in range(_ROUNDS):
         if last is None or not is_off(last, camera.lens.width_px) or is_turned(last, camera.lens):
             break
         moved = _moved(camera, last.scale, last.shift_px, odometry)
-        if moved is None or _is_far(first.lens, moved.lens):
-            return first, fit
+        if moved is None:
+            break
         camera, last = moved, _fit(name, moved).get(name)
     return camera, last
 
@@ -205,9 +210,15 @@ def _fit(name: str, camera: _Camera) -> dict[str, LensFit]:
 
 
 def _by_gyroscope(
-    imu: ImuStream | None, cameras: Mapping[str, _Camera], fits: Mapping[str, LensFit]
+    imu: ImuStream | None,
+    cameras: Mapping[str, _Camera],
+    fits: Mapping[str, LensFit],
+    as_given: frozenset[str],
 ) -> dict[str, float]:
-    """Focal scales of cameras that turn by more or less than the gyroscope and the other cameras say."""
+    """Focal scales of cameras that turn by more or less than the gyroscope and the other cameras say.
+
+    A lens that had to be moved, or that the tracks hardly tell, says nothing about the gyroscope.
+    """
     if imu is None:
         return {}
     turns = {}
@@ -217,7 +228,8 @@ def _by_gyroscope(
         except RigwakeError:
             continue
     sound = frozenset(name for name, fit in fits.items() if not is_off(fit, cameras[name].lens.width_px))
-    wanted = scale_of_lenses(turns, sound)
+    sure = frozenset(name for name in sound & as_given if fits[name].covariance[0, 0] < _SURE_SCALE**2)
+    wanted = scale_of_lenses(turns, sound, sure)
     return {name: s for name, s in wanted.items() if _HARDLY < abs(s - 1) < _FARTHEST_SCALE}
 
 

@@ -51,15 +51,19 @@ def check_scale(
     return (check,), middle if agreed else None
 
 
-def scale_of_lenses(fits: Mapping[str, TurnFit], sound_lenses: frozenset[str]) -> dict[str, float]:
-    """By camera whose lens the gyroscope contradicts: its turns over the gyroscope's, by which its focal length is longer.
+def scale_of_lenses(
+    fits: Mapping[str, TurnFit], sound_lenses: frozenset[str], witnesses: frozenset[str]
+) -> dict[str, float]:
+    """By camera whose lens the gyroscope contradicts: its turns over the gyroscope's, the factor of its focal length.
 
-    Only where several cameras agree that the gyroscope's scale is wrong, it is the gyroscope: none then.
+    witnesses: cameras with lenses known well enough to tell that it is the gyroscope: where most agree on one scale of
+    it, no lens is to blame.
     """
     known = {n: f for n, f in fits.items() if f.unexplained <= _EXPLAINED and n in sound_lenses}
     off = {n: f.scale for n, f in known.items() if _is_off(f)}
-    agreed = len(off) >= 2 and max(off.values()) - min(off.values()) < 2 * _AGREED
-    return {} if agreed and len(off) * 2 > len(known) else off
+    seen = [scale for name, scale in off.items() if name in witnesses]
+    agreed = len(seen) >= 2 and max(seen) - min(seen) < 2 * _AGREED
+    return {} if agreed and len(seen) * 2 > len(known) else off
 
 
 def _is_off(fit: TurnFit) -> bool:
