@@ -182,9 +182,8 @@ def _conclude(
     """Covariance, verdicts and checks."""
     solution = adjusted.solution
     believed = adjusted.intrinsics_priors
-    covariance = covariance_of(
-        solution.problem, clustered=True, prior_spreads=prior_spreads_of(solution.problem, believed)
-    )
+    spreads = prior_spreads_of(solution.problem, believed, adjusted.ignored_intrinsics)
+    covariance = covariance_of(solution.problem, clustered=True, prior_spreads=spreads)
     statistics = residual_statistics(solution)
     for name, numbers in statistics.items():
         numbers |= {"noise_factor": adjusted.noise_factors[name], "dropped": adjusted.dropped[name]}

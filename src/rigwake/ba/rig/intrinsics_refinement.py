@@ -137,11 +137,14 @@ class KeptDirections:
 
     untold: (P, h) along which the motion tells next to nothing. agreeing: (P, g) all others of a lens that is right as
     far as the motion tells: moving there would only add noise. Of a lens that is contradicted along one direction
-    there is no reason to believe the others, so these are none.
+    there is no reason to believe the others, so these are none. ignored: (P, P) scatter of the scores of the camera's
+    parameters that stands for what the motion asked for all the same, clearly but for less than matters: the lens may
+    be off by that.
     """
 
     untold: Array
     agreeing: Array
+    ignored: Array
 
 
 def kept_directions(
@@ -149,6 +152,7 @@ def kept_directions(
 ) -> dict[str, KeptDirections]:
     """By camera with free intrinsics, what to leave as believed, at the optimum of `problem` and its covariance."""
     found = {}
+    alone = replace(covariance, excess=None)  # as the information has it
     for camera in problem.cameras:
         if "intrinsics" in camera.free and camera.name in believed:
             prior = believed[camera.name]
@@ -156,14 +160,18 @@ def kept_directions(
             L = _root(prior)
             # what not even the prior determines beside everything else is as open as the prior leaves it
             if not known.all():
-                spread = np.asarray(np.linalg.inv(prior.information))
+                spread = np.asarray(np.linalg.inv(prior.information))  # then nothing is told, nor ignored
             values, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, spread).T))
             moved = vectors.T @ np.linalg.solve(L, camera.model.params - prior.mean)
             told = values <= _UNTOLD**2
             contradicts = told & (moved**2 > _CONTRADICTION**2 * values)
             followed = prior.mean + L @ vectors @ np.where(contradicts, moved, 0.0)
             right = _barely_moved(problem, camera, prior, followed)
-            found[camera.name] = KeptDirections(vectors[:, ~told], vectors[:, told & right])
+            off = followed - prior.mean if right else np.zeros(len(moved))
+            score = np.linalg.solve(alone.parameter(camera.name, "intrinsics")[0], off) if off.any() else off
+            found[camera.name] = KeptDirections(
+                vectors[:, ~told], vectors[:, told & right], np.outer(score, score)
+            )
     return found
 
 
@@ -194,9 +202,9 @@ def priors_of(problem: RigProblem) -> dict[str, VectorPrior]:
 
 
 def prior_spreads_of(
-    problem: RigProblem, believed: Mapping[str, VectorPrior]
+    problem: RigProblem, believed: Mapping[str, VectorPrior], ignored: Mapping[str, Array] | None = None
 ) -> dict[tuple[str, str], Array]:
-    """For `covariance_of`: what held parameters may really be off by.
+    """For `covariance_of`: what held parameters may really be off by. ignored: by camera, as of `KeptDirections`.
 
     The solver was given `T = P^-1 + X` for a prior of covariance P, X large where a parameter is held. Its scores
     really scatter by `T P T`, which is `X + X P X` more than the T that the information takes them for.
@@ -206,7 +214,8 @@ def prior_spreads_of(
         prior, true = camera.intrinsics_prior, believed.get(camera.name)
         if prior is not None and true is not None and "intrinsics" in camera.free:
             X = prior.information - true.information
-            prior_spreads[(camera.name, "intrinsics")] = X + X @ np.linalg.inv(true.information) @ X
+            held = X + X @ np.linalg.inv(true.information) @ X
+            prior_spreads[(camera.name, "intrinsics")] = held + (ignored or {}).get(camera.name, 0.0)
     return prior_spreads
 
 
