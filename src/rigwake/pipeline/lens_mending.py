@@ -228,8 +228,9 @@ def _by_gyroscope(
         except RigwakeError:
             continue
     sound = frozenset(name for name, fit in fits.items() if not is_off(fit, cameras[name].lens.width_px))
+    moved = cameras.keys() - as_given
     sure = frozenset(name for name in sound & as_given if fits[name].covariance[0, 0] < _SURE_SCALE**2)
-    wanted = scale_of_lenses(turns, sound, sure)
+    wanted = scale_of_lenses(turns, sound | moved, sure)
     return {name: s for name, s in wanted.items() if _HARDLY < abs(s - 1) < _FARTHEST_SCALE}
 
 

@@ -25,8 +25,10 @@ _FOCAL = frozenset({"fx", "fy", "mu", "mv", "a0"})
 _CENTRE = frozenset({"cx", "cy", "u0", "v0"})
 _FEWEST_PIXELS = 50
 _UNTOLD = 0.3  # of the prior's deviation: errors that nobody foresees would pull at what is known so little
-_BARELY_PX = 0.1  # RMS: lenses of rendered recordings, which are exact, come out 0.02 to 0.05 px off
-_CONTRADICTION = 2.5  # deviations by which the motion must contradict what was believed, to be followed
+_BARELY_PX = 0.05  # RMS: lenses of rendered recordings, which are exact, come out 0.02 to 0.05 px off
+# deviations by which the motion must contradict what was believed, to be followed: there are tens of directions, and
+# the bias of tracks makes 3.5 of exact lenses; a real lens that is a tenth of a pixel off makes 7
+_CONTRADICTION = 4.0
 FIRMLY, JUDGED = 1e-4, 1e-2  # of the prior's deviation: how held directions are held to solve, and to judge
 _NEVER = 1e-6  # what a parameter that is not estimated may move the pixels by
 _TURN = "a turn of 60 degrees or more to both sides while near and far points cross the whole picture would show them"
