@@ -29,8 +29,8 @@ from rigwake.odometry.monocular import estimate_monocular
 from rigwake.odometry.odometry_options import OdometryOptions
 from rigwake.pipeline.stream_selection import Selection
 from rigwake.plausibility.lens_checks import check_lenses, fit_lenses, is_off, is_turned
-from rigwake.plausibility.lens_fit import LensFit
-from rigwake.plausibility.turn_checks import scale_of_lenses
+from rigwake.plausibility.lens_fit import LensFit, fit_lens
+from rigwake.plausibility.turn_checks import EXPLAINED, scale_of_lenses
 from rigwake.plausibility.turn_fit import fit_turns
 from rigwake.plausibility.values import SensorCheck, refuse
 from rigwake.recording import ImuStream
@@ -45,6 +45,8 @@ _FARTHEST_SCALE, _FARTHEST_SHIFT = 0.1, 0.08  # a lens further off (centre: of t
 _AGAIN_PX = 2.0  # RMS: what was made with a lens so far off is made again
 _UNLIKELY = 1e-3
 _SURE_SCALE = 0.004  # deviation
+_HELD_SCALE = 1e-5
+_HARDLY_PX = 1.0
 _HARDLY = 0.002  # a scale nearer to one is not worth another round
 
 
@@ -91,7 +93,7 @@ def mend_lenses(
     given = {name: camera.lens for name, camera in cameras.items()}
     fits: dict[str, LensFit] = {}
     for name, camera in cameras.items():
-        cameras[name], fit = _by_own_tracks(name, camera, odometry)
+        cameras[name], fit = _by_own_tracks(name, camera, selection.imu, odometry)
         if fit is not None:
             fits[name] = fit
     as_given = frozenset(name for name, camera in cameras.items() if camera.lens is given[name])
@@ -100,7 +102,10 @@ def mend_lenses(
         if moved is not None:
             cameras[name] = moved
     for name, camera in cameras.items():
-        if _is_far(given[name], camera.lens):  # another camera's
+        lost = (
+            name not in as_given and selection.imu is not None and _turned_by(camera, selection.imu) is None
+        )
+        if lost or _is_far(given[name], camera.lens):  # no better, or another camera's
             cameras[name] = _Camera(given[name], tracks[name], trajectories[name])
             fits |= _fit(name, cameras[name])
     moved_now = frozenset(name for name, camera in cameras.items() if camera.lens is not given[name])
@@ -191,18 +196,43 @@ def refuse_contradicted(mended: MendedLenses, lenses: Mapping[str, CameraModel])
 
 
 def _by_own_tracks(
-    name: str, camera: _Camera, odometry: OdometryOptions | None
+    name: str, camera: _Camera, imu: ImuStream | None, odometry: OdometryOptions | None
 ) -> tuple[_Camera, LensFit | None]:
-    """The camera with its lens where pairs of its images want it, and the last fit."""
+    """The camera with its lens where pairs of its images want it, and the last fit.
+
+    Wrong distortion looks like a wrong focal length in pairs of images; in how far the camera turns, hardly. So the
+    gyroscope tells the focal length where there is one.
+    """
     last = _fit(name, camera).get(name)
     for _ in range(_ROUNDS):
         if last is None or not is_off(last, camera.lens.width_px) or is_turned(last, camera.lens):
             break
-        moved = _moved(camera, last.scale, last.shift_px, odometry)
+        scale, shift = last.scale, last.shift_px
+        turned = _turned_by(camera, imu)
+        if turned is not None:
+            try:
+                held = fit_lens(camera.tracks, camera.lens, camera.trajectory, scale_std=_HELD_SCALE)
+            except RigwakeError:
+                break
+            scale, shift = turned, held.shift_px
+        moved = _moved(camera, scale, shift, odometry)
         if moved is None:
             break
         camera, last = moved, _fit(name, moved).get(name)
+        if turned is not None and np.abs(shift).max() < _HARDLY_PX and abs(turned - 1) < _HARDLY:
+            break  # what remains is distortion
     return camera, last
+
+
+def _turned_by(camera: _Camera, imu: ImuStream | None) -> float | None:
+    """The camera's turns over the gyroscope's, None where they have too little in common."""
+    if imu is None:
+        return None
+    try:
+        fit = fit_turns(camera.trajectory, imu)
+    except RigwakeError:
+        return None
+    return fit.scale if fit.unexplained <= EXPLAINED and abs(fit.scale - 1) < _FARTHEST_SCALE else None
 
 
 def _fit(name: str, camera: _Camera) -> dict[str, LensFit]:

@@ -13,7 +13,7 @@ from rigwake.geometry import so3
 from rigwake.plausibility.turn_fit import TurnFit, rotation_between
 from rigwake.plausibility.values import SensorCheck
 
-_EXPLAINED = 0.15
+EXPLAINED = 0.15
 _SCALE = 0.01
 _AGREED = 0.004  # spread of the scales that cameras ask for, to be one scale
 _SIGMAS = 6.0
@@ -31,7 +31,7 @@ def check_scale(
     where fewer than two cameras agree on one.
     """
     quantity = "a camera's turns over the gyroscope's"
-    known = {n: f for n, f in fits.items() if f.unexplained <= _EXPLAINED and n in sound_lenses}
+    known = {n: f for n, f in fits.items() if f.unexplained <= EXPLAINED and n in sound_lenses}
     if not known:
         return (), None
     middle = float(np.median([f.scale for f in known.values()]))
@@ -59,7 +59,7 @@ def scale_of_lenses(
     witnesses: cameras with lenses known well enough to tell that it is the gyroscope: where most agree on one scale of
     it, no lens is to blame.
     """
-    known = {n: f for n, f in fits.items() if f.unexplained <= _EXPLAINED and n in sound_lenses}
+    known = {n: f for n, f in fits.items() if f.unexplained <= EXPLAINED and n in sound_lenses}
     off = {n: f.scale for n, f in known.items() if _is_off(f)}
     seen = [scale for name, scale in off.items() if name in witnesses]
     agreed = len(seen) >= 2 and max(seen) - min(seen) < 2 * _AGREED
@@ -79,7 +79,7 @@ def _camera_scale(name: str, fit: TurnFit) -> SensorCheck:
 def check_clocks(fits: Mapping[str, TurnFit]) -> tuple[SensorCheck, ...]:
     """Clocks that drift: one camera's against the IMU, or the IMU's against all cameras."""
     quantity = "seconds lost against the IMU's clock per second"
-    known = {n: f for n, f in fits.items() if f.unexplained <= _EXPLAINED}
+    known = {n: f for n, f in fits.items() if f.unexplained <= EXPLAINED}
     off = {n: f for n, f in known.items() if abs(f.drift) > max(_DRIFT, _SIGMAS * f.std[8])}
     common = float(np.median([f.drift for f in known.values()])) if known else 0.0
     alike = [n for n, f in off.items() if abs(f.drift - common) < max(0.3 * abs(common), 3 * f.std[8])]
