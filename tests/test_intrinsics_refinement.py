@@ -114,6 +114,24 @@ def test_what_is_held_counts_as_the_dense_algebra_says() -> None:
     np.testing.assert_allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-3)
 
 
+def test_what_is_ignored_counts_as_an_error() -> None:
+    problem = small_rig(8.0)
+    sharp = replace(problem.observations, std_px=problem.observations.std_px / 1000)
+    problem = replace(problem, observations=sharp)
+    shift = np.array([0, 0, 0.03, -0.02, 0, 0, 0, 0])
+    believed = {n: replace(p, mean=p.mean + shift) for n, p in priors_of(problem).items()}
+    covariance = covariance_of(problem)
+    kept = kept_directions(problem, covariance, believed)
+    name = problem.cameras[0].name
+    assert kept[name].untold.shape[1] + kept[name].agreeing.shape[1] == 8  # too little to follow
+    ignored = {name: kept[name].ignored}
+    wider = covariance_of(problem, prior_spreads=prior_spreads_of(problem, priors_of(problem), ignored))
+    more = wider.parameter(name, "intrinsics")[0] - covariance.parameter(name, "intrinsics")[0]
+    assert np.sqrt(more[2, 2]) == pytest.approx(0.03, rel=0.1)
+    assert np.sqrt(more[3, 3]) == pytest.approx(0.02, rel=0.1)
+    assert np.linalg.matrix_rank(more, tol=1e-3 * np.trace(more)) == 1
+
+
 def test_a_narrow_prior_is_narrow() -> None:
     wide, narrow = (intrinsics_prior(FISHEYE, PIXELS, IntrinsicsWidth(f, c, d)).information for f, c, d in
                     ((0.01, 5.0, 0.02), (0.001, 0.5, 0.002)))  # fmt: skip

@@ -33,21 +33,20 @@ from rigwake.pipeline.camera_stage import (
     stage_files,
     tracks_file,
 )
-from rigwake.pipeline.lens_mending import MendedLenses, mend_lenses, refuse_contradicted
 from rigwake.pipeline.out_folder import check_camera_names, check_out_folder, clear_results, used_by_one
 from rigwake.pipeline.outputs import write_outputs
 from rigwake.pipeline.prior import RigPrior
-from rigwake.pipeline.rig_stage import RigEstimate, estimate_rig, initialise_rig
-from rigwake.pipeline.sensor_checks import VettedSensors, vet_imu, vet_sensors
+from rigwake.pipeline.sensor_checks import vet_imu
 from rigwake.pipeline.stage_files import StageLedger
 from rigwake.pipeline.stream_selection import Selection, select
+from rigwake.pipeline.vetted_rig import VettedRig, estimate_vetted_rig
 from rigwake.plausibility.values import SensorCheck, checks_to_list
 from rigwake.readers.open import open_recording
 from rigwake.readers.topics import TopicMap
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.recording import Recording
 from rigwake.report import build_report, load_report_content
-from rigwake.tracks import Tracks, load_tracks
+from rigwake.tracks import load_tracks
 from rigwake.trajectory import Trajectory
 
 _MOVED_PX = 0.5  # worth a word
@@ -141,73 +140,27 @@ def _prepare(
     return _Prepared(path, opened, selection, given, prior, config)
 
 
-@dataclass(frozen=True, eq=False)
-class _Estimated:
-    """own: the trajectories that were used, by camera. vetted: the sensors that were, and what was said of them."""
-
-    own: Mapping[str, Trajectory]
-    first: InitialRig
-    rig: RigEstimate
-    vetted: VettedSensors
-
-
 def _estimate(
     prepared: _Prepared, out: Path, selection: Selection, outcomes: list[CameraOutcome], progress: Progress
-) -> _Estimated:
+) -> VettedRig:
     """Initial values and the rig, of the cameras that did not fail and the sensors that agree."""
-    config = prepared.config
     working = _working(outcomes)
-    tracks = {name: load_tracks(tracks_file(out, name)) for name in working}
     own = _trajectories(working, out, prepared.external)
-    vetted, mended = _compared(prepared, selection, tracks, own, outcomes, progress)
-    selection = vetted.selection
-    own = {name: path for name, path in mended.trajectories.items() if name in selection.cameras}
-    prior = without_cameras(prepared.prior, prepared.selection.cameras.keys() - own.keys())
-    first = initialise_rig(selection, own, config, prior)
-    save_calibration(first.handeye, out / "initial_rig.yaml")
-    rig = estimate_rig(
+    missing = prepared.selection.cameras.keys() - own.keys()
+    found = estimate_vetted_rig(
         prepared.opened,
         selection,
-        mended.tracks,
-        first,
-        config,
-        prior,
+        {name: load_tracks(tracks_file(out, name)) for name in working},
+        own,
+        prepared.config,
+        without_cameras(prepared.prior, missing),
         masks=out / "masks",
-        widths=mended.moved,
+        external=prepared.external is not None,
+        without_horizon=frozenset(o.name for o in outcomes if o.without_horizon),
         progress=lambda words, fraction: progress("rig", words, fraction),
     )
-    cameras = rig.calibration.cameras
-    refuse_contradicted(mended, {n: c.model for n, c in cameras.items() if c.model is not None})
-    return _Estimated(own, first, rig, vetted)
-
-
-def _compared(
-    prepared: _Prepared,
-    selection: Selection,
-    tracks: Mapping[str, Tracks],
-    own: Mapping[str, Trajectory],
-    outcomes: list[CameraOutcome],
-    progress: Progress,
-) -> tuple[VettedSensors, MendedLenses]:
-    """Every sensor against the others; lenses that are to be refined are mended before, if they are wrong."""
-    config, external = prepared.config, prepared.external is not None
-    if not config.sensor_checks:
-        return VettedSensors(selection), MendedLenses(selection, tracks, own)
-    progress("rig", "comparing the sensors", 0.0)
-    odd = frozenset(o.name for o in outcomes if o.without_horizon)
-    odometry = None if external else replace(config.odometry, seed=config.seed)
-    mended = MendedLenses(selection, tracks, own)
-    if config.intrinsics != "fixed":
-        mended = mend_lenses(selection, tracks, own, odometry)
-    vetted = vet_sensors(
-        mended.selection,
-        mended.tracks,
-        mended.trajectories,
-        without_horizon=odd,
-        lenses=mended.fits,
-        repair=config.repair,
-    )
-    return replace(vetted, checks=(*mended.checks, *vetted.checks)), mended
+    save_calibration(found.first.handeye, out / "initial_rig.yaml")
+    return found
 
 
 def _conclude(
@@ -215,7 +168,7 @@ def _conclude(
     out: Path,
     outcomes: list[CameraOutcome],
     checks: tuple[SensorCheck, ...],
-    estimated: _Estimated,
+    estimated: VettedRig,
     provenance: dict[str, Any],
     progress: Progress,
 ) -> CalibrationRun:

@@ -12,9 +12,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from rigwake._types import Array
-from rigwake.ba.rig.intrinsics_refinement import IntrinsicsWidth
+from rigwake.ba.rig.intrinsics_refinement import (
+    FROM_A_FILE,
+    IntrinsicsWidth,
+    LensBelief,
+    intrinsics_prior,
+    moved_px,
+)
 from rigwake.cameras.moved_lens import moved_lens
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import RigwakeError
@@ -22,8 +29,8 @@ from rigwake.odometry.monocular import estimate_monocular
 from rigwake.odometry.odometry_options import OdometryOptions
 from rigwake.pipeline.stream_selection import Selection
 from rigwake.plausibility.lens_checks import check_lenses, fit_lenses, is_off, is_turned
-from rigwake.plausibility.lens_fit import LensFit
-from rigwake.plausibility.turn_checks import scale_of_lenses
+from rigwake.plausibility.lens_fit import LensFit, fit_lens
+from rigwake.plausibility.turn_checks import EXPLAINED, scale_of_lenses
 from rigwake.plausibility.turn_fit import fit_turns
 from rigwake.plausibility.values import SensorCheck, refuse
 from rigwake.recording import ImuStream
@@ -35,19 +42,26 @@ DISBELIEVED = IntrinsicsWidth(focal=0.02, centre_px=10.0, distortion=0.1, aspect
 
 _ROUNDS = 3
 _FARTHEST_SCALE, _FARTHEST_SHIFT = 0.1, 0.08  # a lens further off (centre: of the width) is another camera's
+_AGAIN_PX = 2.0  # RMS: what was made with a lens so far off is made again
+_UNLIKELY = 1e-3
+_SURE_SCALE = 0.004  # deviation
+_HELD_SCALE = 1e-5
+_HARDLY_PX = 1.0
 _HARDLY = 0.002  # a scale nearer to one is not worth another round
 
 
 @dataclass(frozen=True, eq=False)
 class MendedLenses:
     """What takes part, with better lenses. fits: of the lenses as they are now; None where they were not looked at.
-    moved: by camera, those that were moved. checks: what was wrong with them, and what was done."""
+    beliefs: by camera, the priors of those that are not as given; moved: which of them tracks or gyroscope contradict.
+    checks: what was wrong with them, and what was done."""
 
     selection: Selection
     tracks: Mapping[str, Tracks]
     trajectories: Mapping[str, Trajectory]
     fits: Mapping[str, LensFit] | None = None
-    moved: Mapping[str, IntrinsicsWidth] = field(default_factory=dict)
+    beliefs: Mapping[str, LensBelief] = field(default_factory=dict)
+    moved: frozenset[str] = frozenset()
     checks: tuple[SensorCheck, ...] = ()
 
 
@@ -79,28 +93,93 @@ def mend_lenses(
     given = {name: camera.lens for name, camera in cameras.items()}
     fits: dict[str, LensFit] = {}
     for name, camera in cameras.items():
-        cameras[name], fit = _by_own_tracks(name, camera, odometry)
+        cameras[name], fit = _by_own_tracks(name, camera, selection.imu, odometry)
         if fit is not None:
             fits[name] = fit
-    for name, scale in _by_gyroscope(selection.imu, cameras, fits).items():
+    as_given = frozenset(name for name, camera in cameras.items() if camera.lens is given[name])
+    for name, scale in _by_gyroscope(selection.imu, cameras, fits, as_given).items():
         moved = _moved(cameras[name], scale, np.zeros(2), odometry)
         if moved is not None:
             cameras[name] = moved
-            fits |= _fit(name, moved)
-    widths = {name: DISBELIEVED for name, camera in cameras.items() if camera.lens is not given[name]}
+    for name, camera in cameras.items():
+        lost = (
+            name not in as_given and selection.imu is not None and _turned_by(camera, selection.imu) is None
+        )
+        if lost or _is_far(given[name], camera.lens):  # no better, or another camera's
+            cameras[name] = _Camera(given[name], tracks[name], trajectories[name])
+            fits |= _fit(name, cameras[name])
+    moved_now = frozenset(name for name, camera in cameras.items() if camera.lens is not given[name])
+    # nor is what a board told of it believed
     streams = {
-        name: replace(stream, model=cameras[name].lens, intrinsics_covariance=None)
-        if name in widths
-        else stream
+        name: replace(stream, intrinsics_covariance=None) if name in moved_now else stream
         for name, stream in selection.cameras.items()
     }
-    return MendedLenses(
-        replace(selection, cameras=streams),
-        {name: cameras[name].tracks if name in cameras else own for name, own in tracks.items()},
-        {name: cameras[name].trajectory if name in cameras else own for name, own in trajectories.items()},
-        fits,
-        widths,
-        tuple(_check(name, given[name], cameras[name].lens) for name in widths),
+    start = MendedLenses(replace(selection, cameras=streams), tracks, trajectories)
+    found = _with_cameras(start, cameras, moved_now)
+    return replace(
+        found,
+        # what is left of a lens that was moved is for the rig to mend
+        fits={name: fit for name, fit in fits.items() if name not in moved_now},
+        beliefs={name: LensBelief(cameras[name].lens, DISBELIEVED) for name in moved_now},
+        moved=moved_now,
+        checks=tuple(_check(name, given[name], cameras[name].lens) for name in sorted(moved_now)),
+    )
+
+
+def started_from(
+    mended: MendedLenses, lenses: Mapping[str, CameraModel], odometry: OdometryOptions | None
+) -> MendedLenses:
+    """The same with lenses that the rig moved by pixels: bearings and trajectories by them, priors as they were.
+
+    lenses: refined, by camera. `mended` itself where all moved little.
+    """
+    cameras = {}
+    for name, lens in lenses.items():
+        former, own = mended.selection.cameras[name].model, mended.tracks[name]
+        if former is not None and _rms_px(former, lens, own.pixels) > _AGAIN_PX:
+            again = _seen_by(lens, own, mended.trajectories[name], odometry)
+            if again is not None:
+                cameras[name] = again
+    if not cameras and not mended.moved:
+        return mended
+    beliefs = {}
+    for name, camera in cameras.items():
+        former = mended.selection.cameras[name].model
+        if former is not None:
+            doubted = _contradicts(former, camera.lens, camera.tracks.pixels)
+            beliefs[name] = LensBelief(former, DISBELIEVED if doubted else FROM_A_FILE)
+    found = _with_cameras(mended, cameras, frozenset(cameras))
+    models = {n: m for n in found.trajectories if (m := found.selection.cameras[n].model) is not None}
+    fits = fit_lenses(found.tracks, models, found.trajectories)
+    return replace(found, beliefs={**beliefs, **mended.beliefs}, fits=fits)
+
+
+def _contradicts(believed: CameraModel, found: CameraModel, pixels: Array) -> bool:
+    """Whether a lens is too far from the one believed for its prior to have been right."""
+    prior = intrinsics_prior(believed, pixels)
+    moved = found.params - prior.mean
+    return bool(moved @ prior.information @ moved > chi2.isf(_UNLIKELY, len(moved)))
+
+
+def _rms_px(before: CameraModel, after: CameraModel, pixels: Array) -> float:
+    moved = np.linalg.norm(moved_px(before, after, pixels), axis=1)
+    moved = moved[np.isfinite(moved)]
+    return float(np.sqrt(np.mean(moved**2))) if len(moved) else 0.0
+
+
+def _with_cameras(
+    mended: MendedLenses, cameras: Mapping[str, _Camera], changed: frozenset[str]
+) -> MendedLenses:
+    """With the lenses, tracks and trajectories of the cameras that changed."""
+    streams = {
+        name: replace(stream, model=cameras[name].lens) if name in changed else stream
+        for name, stream in mended.selection.cameras.items()
+    }
+    return replace(
+        mended,
+        selection=replace(mended.selection, cameras=streams),
+        tracks={**mended.tracks, **{name: cameras[name].tracks for name in changed}},
+        trajectories={**mended.trajectories, **{name: cameras[name].trajectory for name in changed}},
     )
 
 
@@ -117,19 +196,43 @@ def refuse_contradicted(mended: MendedLenses, lenses: Mapping[str, CameraModel])
 
 
 def _by_own_tracks(
-    name: str, camera: _Camera, odometry: OdometryOptions | None
+    name: str, camera: _Camera, imu: ImuStream | None, odometry: OdometryOptions | None
 ) -> tuple[_Camera, LensFit | None]:
-    """The camera with its lens where pairs of its images want it, and the last fit; as it was where that fails."""
-    first, fit = camera, _fit(name, camera).get(name)
-    last = fit
+    """The camera with its lens where pairs of its images want it, and the last fit.
+
+    Wrong distortion looks like a wrong focal length in pairs of images; in how far the camera turns, hardly. So the
+    gyroscope tells the focal length where there is one.
+    """
+    last = _fit(name, camera).get(name)
     for _ in range(_ROUNDS):
         if last is None or not is_off(last, camera.lens.width_px) or is_turned(last, camera.lens):
             break
-        moved = _moved(camera, last.scale, last.shift_px, odometry)
-        if moved is None or _is_far(first.lens, moved.lens):
-            return first, fit
+        scale, shift = last.scale, last.shift_px
+        turned = _turned_by(camera, imu)
+        if turned is not None:
+            try:
+                held = fit_lens(camera.tracks, camera.lens, camera.trajectory, scale_std=_HELD_SCALE)
+            except RigwakeError:
+                break
+            scale, shift = turned, held.shift_px
+        moved = _moved(camera, scale, shift, odometry)
+        if moved is None:
+            break
         camera, last = moved, _fit(name, moved).get(name)
+        if turned is not None and np.abs(shift).max() < _HARDLY_PX and abs(turned - 1) < _HARDLY:
+            break  # what remains is distortion
     return camera, last
+
+
+def _turned_by(camera: _Camera, imu: ImuStream | None) -> float | None:
+    """The camera's turns over the gyroscope's, None where they have too little in common."""
+    if imu is None:
+        return None
+    try:
+        fit = fit_turns(camera.trajectory, imu)
+    except RigwakeError:
+        return None
+    return fit.scale if fit.unexplained <= EXPLAINED and abs(fit.scale - 1) < _FARTHEST_SCALE else None
 
 
 def _fit(name: str, camera: _Camera) -> dict[str, LensFit]:
@@ -137,9 +240,15 @@ def _fit(name: str, camera: _Camera) -> dict[str, LensFit]:
 
 
 def _by_gyroscope(
-    imu: ImuStream | None, cameras: Mapping[str, _Camera], fits: Mapping[str, LensFit]
+    imu: ImuStream | None,
+    cameras: Mapping[str, _Camera],
+    fits: Mapping[str, LensFit],
+    as_given: frozenset[str],
 ) -> dict[str, float]:
-    """Focal scales of cameras that turn by more or less than the gyroscope and the other cameras say."""
+    """Focal scales of cameras that turn by more or less than the gyroscope and the other cameras say.
+
+    A lens that had to be moved, or that the tracks hardly tell, says nothing about the gyroscope.
+    """
     if imu is None:
         return {}
     turns = {}
@@ -149,7 +258,9 @@ def _by_gyroscope(
         except RigwakeError:
             continue
     sound = frozenset(name for name, fit in fits.items() if not is_off(fit, cameras[name].lens.width_px))
-    wanted = scale_of_lenses(turns, sound)
+    moved = cameras.keys() - as_given
+    sure = frozenset(name for name in sound & as_given if fits[name].covariance[0, 0] < _SURE_SCALE**2)
+    wanted = scale_of_lenses(turns, sound | moved, sure)
     return {name: s for name, s in wanted.items() if _HARDLY < abs(s - 1) < _FARTHEST_SCALE}
 
 
@@ -159,13 +270,22 @@ def _moved(
     """The camera with a moved lens, bearings and trajectory by it; None where that cannot be."""
     try:
         lens = moved_lens(camera.lens, scale, shift_px)
-        bearings, seen = lens.unproject(camera.tracks.pixels)
-        tracks = replace(camera.tracks, bearings_cam=bearings).take(np.flatnonzero(seen))
-        if odometry is None:
-            return _Camera(lens, tracks, camera.trajectory)
-        return _Camera(lens, tracks, estimate_monocular(tracks, lens, odometry).trajectory)
     except RigwakeError:
         return None
+    return _seen_by(lens, camera.tracks, camera.trajectory, odometry)
+
+
+def _seen_by(
+    lens: CameraModel, tracks: Tracks, trajectory: Trajectory, odometry: OdometryOptions | None
+) -> _Camera | None:
+    """Bearings and trajectory by this lens; None where there is no trajectory."""
+    bearings, seen = lens.unproject(tracks.pixels)
+    tracks = replace(tracks, bearings_cam=bearings).take(np.flatnonzero(seen))
+    try:
+        found = trajectory if odometry is None else estimate_monocular(tracks, lens, odometry).trajectory
+    except RigwakeError:
+        return None
+    return _Camera(lens, tracks, found)
 
 
 def _is_far(given: CameraModel, lens: CameraModel) -> bool:

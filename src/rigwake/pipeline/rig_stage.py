@@ -13,7 +13,7 @@ from rigwake.ba.rig.association_rounds import CrossCameraMatches, adjust_with_as
 from rigwake.ba.rig.imu_noise import imu_noise_factors
 from rigwake.ba.rig.initialisation import initial_rig
 from rigwake.ba.rig.intrinsics_refinement import (
-    IntrinsicsWidth,
+    LensBelief,
     intrinsics_statistics,
     prior_spreads_of,
     priors_of,
@@ -56,6 +56,11 @@ class RigEstimate:
     matches: CrossCameraMatches
     sensor_checks: tuple[SensorCheck, ...] = ()
 
+    @property
+    def lenses(self) -> dict[str, CameraModel]:
+        """By camera, as the bundle adjustment left it."""
+        return {camera.name: camera.model for camera in self.adjusted.solution.problem.cameras}
+
 
 def initialise_rig(
     selection: Selection, trajectories: Mapping[str, Trajectory], config: CalibrateConfig, prior: RigPrior
@@ -83,14 +88,14 @@ def estimate_rig(
     prior: RigPrior,
     *,
     masks: Path,
-    widths: Mapping[str, IntrinsicsWidth] | None = None,
+    beliefs: Mapping[str, LensBelief] | None = None,
     progress: StageProgress = lambda words, fraction: None,
 ) -> RigEstimate:
     """The rig from initial values and what was tracked.
 
     tracks: by camera, of all that `first` knows. prior: the one that `first` was made with. masks: folder of the
-    cameras' masks, for cross-camera association. widths: how far intrinsics may be off, of cameras whose lens was found
-    to be wrong; those given are the `recording`'s. Images are only read with `config.adjustment.cross_camera`.
+    cameras' masks, for cross-camera association. beliefs: priors of intrinsics, of cameras whose lens is not the one
+    given, which is the `recording`'s. Images are only read with `config.adjustment.cross_camera`.
 
     Raises UsageError for a reference that is not there, UnobservableError when the motion
     determines nothing, EstimationError when no trustworthy answer was found.
@@ -98,7 +103,7 @@ def estimate_rig(
     measurements = RigMeasurements(
         {name: tracks[name] for name in first.cameras}, selection.imu, selection.gnss
     )
-    adjusted, matches = _adjust(measurements, first, prior, selection, config, masks, widths or {}, progress)
+    adjusted, matches = _adjust(measurements, first, prior, selection, config, masks, beliefs or {}, progress)
     progress("checking", 0.8)
     reference = replace(
         reference_frame(recording, selection, first, config.reference), is_metric=first.scale_source != "none"
@@ -125,12 +130,12 @@ def _adjust(
     selection: Selection,
     config: CalibrateConfig,
     masks: Path,
-    widths: Mapping[str, IntrinsicsWidth],
+    beliefs: Mapping[str, LensBelief],
     progress: StageProgress,
 ) -> tuple[AdjustedRig, CrossCameraMatches]:
     """The rig bundle adjustment: alone first, then with landmarks associated across cameras and times."""
     assembled = assemble_problem(measurements, first, config.adjustment)
-    problem = _with_intrinsics(prior.constrained(assembled.problem), selection, config, widths)
+    problem = _with_intrinsics(prior.constrained(assembled.problem), selection, config, beliefs)
     believed, assembled = priors_of(problem), replace(assembled, problem=problem)
     progress(f"adjusting {len(assembled.problem.observations)} observations", 0.0)
     adjusted = adjust(assembled, config.adjustment, final=not config.adjustment.cross_camera)
@@ -151,7 +156,7 @@ def _with_intrinsics(
     problem: RigProblem,
     selection: Selection,
     config: CalibrateConfig,
-    widths: Mapping[str, IntrinsicsWidth],
+    beliefs: Mapping[str, LensBelief],
 ) -> RigProblem:
     """The problem with intrinsics free, about what is believed of them; as it is where they are to be trusted."""
     if config.intrinsics == "fixed":
@@ -161,7 +166,7 @@ def _with_intrinsics(
         for name, stream in selection.cameras.items()
         if stream.intrinsics_covariance is not None
     }
-    return with_free_intrinsics(problem, covariances, widths)
+    return with_free_intrinsics(problem, covariances, beliefs)
 
 
 def _conclude(
@@ -176,9 +181,8 @@ def _conclude(
     """Covariance, verdicts and checks."""
     solution = adjusted.solution
     believed = adjusted.intrinsics_priors
-    covariance = covariance_of(
-        solution.problem, clustered=True, prior_spreads=prior_spreads_of(solution.problem, believed)
-    )
+    spreads = prior_spreads_of(solution.problem, believed, adjusted.ignored_intrinsics)
+    covariance = covariance_of(solution.problem, clustered=True, prior_spreads=spreads)
     statistics = residual_statistics(solution)
     for name, numbers in statistics.items():
         numbers |= {"noise_factor": adjusted.noise_factors[name], "dropped": adjusted.dropped[name]}

@@ -28,6 +28,7 @@ _LEAST_POINTS, _MOST_POINTS = 25, 150
 _ROUNDS = 12
 _STEP_PX = 0.05
 _REPEATS = 4
+_SCALE_STD = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,13 +60,19 @@ class _Pairs:
 
 
 def fit_lens(
-    tracks: Tracks, model: CameraModel, trajectory: Trajectory, *, unbiased: bool = False
+    tracks: Tracks,
+    model: CameraModel,
+    trajectory: Trajectory,
+    *,
+    unbiased: bool = False,
+    scale_std: float = _SCALE_STD,
 ) -> LensFit:
     """Focal scale and shift of the principal point that the tracks ask for.
 
     trajectory: of the camera by its own odometry, which says between which frames it turned, and how.
     unbiased: with few tracks in a pair, their noise pulls the lens one way; the same noise is then added once more,
     and what it does is taken off (simulation and extrapolation, Cook and Stefanski 1994).
+    scale_std: how well the focal scale is known to be one already.
     Raises EstimationError where fewer than 8 pairs of frames share enough tracks over a turn of 8 degrees.
     """
     pairs = _choose_pairs(tracks, trajectory)
@@ -74,16 +81,16 @@ def fit_lens(
             f"{tracks.camera}: only {len(pairs.rotation)} pairs of images show the same points after a turn.",
             consequence="Its lens cannot be checked.",
         )
-    fit = _minimise(pairs, model)
-    return _without_bias(fit, pairs, model) if unbiased else fit
+    fit = _minimise(pairs, model, scale_std)
+    return _without_bias(fit, pairs, model, scale_std) if unbiased else fit
 
 
-def _without_bias(fit: LensFit, pairs: _Pairs, model: CameraModel) -> LensFit:
+def _without_bias(fit: LensFit, pairs: _Pairs, model: CameraModel, scale_std: float) -> LensFit:
     rng = np.random.default_rng(0)
     noisy = []
     for _ in range(_REPEATS):
         first, second = (p + rng.normal(0, fit.refined_rms_px, p.shape) for p in (pairs.first, pairs.second))
-        noisy.append(_minimise(replace(pairs, first=first, second=second), model))
+        noisy.append(_minimise(replace(pairs, first=first, second=second), model, scale_std))
     scale, shift = float(np.mean([f.scale for f in noisy])), np.mean([f.shift_px for f in noisy], axis=0)
     pulled = np.concatenate([[fit.scale - scale], fit.shift_px - shift])
     # what was taken off is itself uncertain
@@ -142,7 +149,7 @@ def _bearings(model: CameraModel, pixels: Array, centre: Array, lens: Array) -> 
     return np.asarray(model.unproject(moved)[0])
 
 
-def _minimise(pairs: _Pairs, model: CameraModel) -> LensFit:
+def _minimise(pairs: _Pairs, model: CameraModel, scale_std: float) -> LensFit:
     """Gauss-Newton on Sampson distances with Cauchy's loss; the poses of the pairs are eliminated pair by pair."""
     centre = model.project(np.array([[0.0, 0.0, 1.0]]))[0][0]
     focal = _pixels_per_radian(model, centre)
@@ -168,7 +175,7 @@ def _minimise(pairs: _Pairs, model: CameraModel) -> LensFit:
         if done <= 3:
             given_rms = robust_std(error)
         reduced, right, back = _eliminate(pairs, error, J_pose, J_lens, weights, damping)
-        prior = (scale**2) / np.array([0.2, 0.2 * focal, 0.2 * focal]) ** 2
+        prior = (scale**2) / np.array([scale_std, 0.2 * focal, 0.2 * focal]) ** 2
         if done < 3:  # poses first, with the lens given
             step_lens = np.zeros(3)
         else:

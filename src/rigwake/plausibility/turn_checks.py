@@ -14,8 +14,9 @@ from rigwake.geometry import so3
 from rigwake.plausibility.turn_fit import TurnFit, rotation_between
 from rigwake.plausibility.values import SensorCheck
 
-_EXPLAINED = 0.15
+EXPLAINED = 0.15
 _SCALE = 0.01
+_AGREED = 0.004  # spread of the scales that cameras ask for, to be one scale
 _SIGMAS = 6.0
 _DRIFT = 2.5e-4
 _TURNED = np.deg2rad(0.2)
@@ -31,11 +32,11 @@ def check_scale(
     where fewer than two cameras agree on one.
     """
     quantity = "a camera's turns over the gyroscope's"
-    known = {n: f for n, f in fits.items() if f.unexplained <= _EXPLAINED and n in sound_lenses}
+    known = {n: f for n, f in fits.items() if f.unexplained <= EXPLAINED and n in sound_lenses}
     if not known:
         return (), None
     middle = float(np.median([f.scale for f in known.values()]))
-    off = {n: f for n, f in known.items() if abs(f.scale - 1) > max(_SCALE, _SIGMAS * f.std[7])}
+    off = {n: f for n, f in known.items() if _is_off(f)}
     if len(off) * 2 <= len(known):
         checks = [SensorCheck("gyroscope", True, middle, 1.0, quantity=quantity)]
         checks += [_camera_scale(name, fit) for name, fit in off.items()]
@@ -47,14 +48,27 @@ def check_scale(
     )
     remedy = "Calibrate the gyroscope's scale, or check its unit and the rate that its stamps claim."
     check = SensorCheck("gyroscope", False, middle, 1.0, f"{words}.", remedy, quantity)
-    agreed = len(off) >= 2 and spread < 0.004 and abs(middle - 1) < 0.1
+    agreed = len(off) >= 2 and spread < _AGREED and abs(middle - 1) < 0.1
     return (check,), middle if agreed else None
 
 
-def scale_of_lenses(fits: Mapping[str, TurnFit], sound_lenses: frozenset[str]) -> dict[str, float]:
-    """By camera that `check_scale` finds wrong, its turns over the gyroscope's: so much longer its focal length is."""
-    wrong = {check.sensor for check in check_scale(fits, sound_lenses)[0] if not check.agrees}
-    return {name: fit.scale for name, fit in fits.items() if f"camera {name}" in wrong}
+def scale_of_lenses(
+    fits: Mapping[str, TurnFit], sound_lenses: frozenset[str], witnesses: frozenset[str]
+) -> dict[str, float]:
+    """By camera whose lens the gyroscope contradicts: its turns over the gyroscope's, the factor of its focal length.
+
+    witnesses: cameras with lenses known well enough to tell that it is the gyroscope: where most agree on one scale of
+    it, no lens is to blame.
+    """
+    known = {n: f for n, f in fits.items() if f.unexplained <= EXPLAINED and n in sound_lenses}
+    off = {n: f.scale for n, f in known.items() if _is_off(f)}
+    seen = [scale for name, scale in off.items() if name in witnesses]
+    agreed = len(seen) >= 2 and max(seen) - min(seen) < 2 * _AGREED
+    return {} if agreed and len(seen) * 2 > len(known) else off
+
+
+def _is_off(fit: TurnFit) -> bool:
+    return bool(abs(fit.scale - 1) > max(_SCALE, _SIGMAS * fit.std[7]))
 
 
 def _camera_scale(name: str, fit: TurnFit) -> SensorCheck:
@@ -66,7 +80,7 @@ def _camera_scale(name: str, fit: TurnFit) -> SensorCheck:
 def check_clocks(fits: Mapping[str, TurnFit]) -> tuple[SensorCheck, ...]:
     """Clocks that drift: one camera's against the IMU, or the IMU's against all cameras."""
     quantity = "seconds lost against the IMU's clock per second"
-    known = {n: f for n, f in fits.items() if f.unexplained <= _EXPLAINED}
+    known = {n: f for n, f in fits.items() if f.unexplained <= EXPLAINED}
     off = {n: f for n, f in known.items() if abs(f.drift) > max(_DRIFT, _SIGMAS * f.std[8])}
     common = float(np.median([f.drift for f in known.values()])) if known else 0.0
     alike = [n for n, f in off.items() if abs(f.drift - common) < max(0.3 * abs(common), 3 * f.std[8])]

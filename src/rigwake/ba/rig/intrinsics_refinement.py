@@ -25,8 +25,10 @@ _FOCAL = frozenset({"fx", "fy", "mu", "mv", "a0"})
 _CENTRE = frozenset({"cx", "cy", "u0", "v0"})
 _FEWEST_PIXELS = 50
 _UNTOLD = 0.3  # of the prior's deviation: errors that nobody foresees would pull at what is known so little
-_BARELY_PX = 0.1  # RMS: lenses of rendered recordings, which are exact, come out 0.02 to 0.05 px off
-_CONTRADICTION = 2.5  # deviations by which the motion must contradict what was believed, to be followed
+_BARELY_PX = 0.05  # RMS: lenses of rendered recordings, which are exact, come out 0.02 to 0.05 px off
+# deviations by which the motion must contradict what was believed, to be followed: there are tens of directions, and
+# the bias of tracks makes 3.5 of exact lenses; a real lens that is a tenth of a pixel off makes 7
+_CONTRADICTION = 4.0
 FIRMLY, JUDGED = 1e-4, 1e-2  # of the prior's deviation: how held directions are held to solve, and to judge
 _NEVER = 1e-6  # what a parameter that is not estimated may move the pixels by
 _TURN = "a turn of 60 degrees or more to both sides while near and far points cross the whole picture would show them"
@@ -105,18 +107,27 @@ def _stds(model: CameraModel, pixels: Array, width: IntrinsicsWidth) -> Array:
     return std
 
 
-def with_free_intrinsics(
-    problem: RigProblem, covariances: Mapping[str, Array], widths: Mapping[str, IntrinsicsWidth] | None = None
-) -> RigProblem:
-    """The problem with the intrinsics of every camera free, about those that it has.
+@dataclass(frozen=True, eq=False)
+class LensBelief:
+    """The lens that a prior is about, and how far it may be off."""
 
-    covariances: by camera, of those that a board calibrated. widths: by camera, where not `FROM_A_FILE`.
+    model: CameraModel
+    width: IntrinsicsWidth = FROM_A_FILE
+
+
+def with_free_intrinsics(
+    problem: RigProblem, covariances: Mapping[str, Array], beliefs: Mapping[str, LensBelief] | None = None
+) -> RigProblem:
+    """The problem with the intrinsics of every camera free.
+
+    covariances: by camera, of those that a board calibrated. beliefs: by camera, of those whose prior is not about
+    the lens that they have, or not as wide as `FROM_A_FILE`.
     """
     cameras = []
     for index, camera in enumerate(problem.cameras):
         pixels = problem.observations.pixels[problem.observations.camera_indices == index]
-        width = (widths or {}).get(camera.name, FROM_A_FILE)
-        prior = intrinsics_prior(camera.model, pixels, width, covariances.get(camera.name))
+        belief = (beliefs or {}).get(camera.name, LensBelief(camera.model))
+        prior = intrinsics_prior(belief.model, pixels, belief.width, covariances.get(camera.name))
         cameras.append(replace(camera, free=camera.free | {"intrinsics"}, intrinsics_prior=prior))
     return replace(problem, cameras=tuple(cameras))
 
@@ -128,11 +139,14 @@ class KeptDirections:
 
     untold: (P, h) along which the motion tells next to nothing. agreeing: (P, g) all others of a lens that is right as
     far as the motion tells: moving there would only add noise. Of a lens that is contradicted along one direction
-    there is no reason to believe the others, so these are none.
+    there is no reason to believe the others, so these are none. ignored: (P, P) scatter of the scores of the camera's
+    parameters that stands for what the motion asked for all the same, clearly but for less than matters: the lens may
+    be off by that.
     """
 
     untold: Array
     agreeing: Array
+    ignored: Array
 
 
 def kept_directions(
@@ -140,6 +154,7 @@ def kept_directions(
 ) -> dict[str, KeptDirections]:
     """By camera with free intrinsics, what to leave as believed, at the optimum of `problem` and its covariance."""
     found = {}
+    alone = replace(covariance, excess=None)  # as the information has it
     for camera in problem.cameras:
         if "intrinsics" in camera.free and camera.name in believed:
             prior = believed[camera.name]
@@ -147,14 +162,18 @@ def kept_directions(
             L = _root(prior)
             # what not even the prior determines beside everything else is as open as the prior leaves it
             if not known.all():
-                spread = np.asarray(np.linalg.inv(prior.information))
+                spread = np.asarray(np.linalg.inv(prior.information))  # then nothing is told, nor ignored
             values, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, spread).T))
             moved = vectors.T @ np.linalg.solve(L, camera.model.params - prior.mean)
             told = values <= _UNTOLD**2
             contradicts = told & (moved**2 > _CONTRADICTION**2 * values)
             followed = prior.mean + L @ vectors @ np.where(contradicts, moved, 0.0)
             right = _barely_moved(problem, camera, prior, followed)
-            found[camera.name] = KeptDirections(vectors[:, ~told], vectors[:, told & right])
+            off = followed - prior.mean if right else np.zeros(len(moved))
+            score = np.linalg.solve(alone.parameter(camera.name, "intrinsics")[0], off) if off.any() else off
+            found[camera.name] = KeptDirections(
+                vectors[:, ~told], vectors[:, told & right], np.outer(score, score)
+            )
     return found
 
 
@@ -185,9 +204,9 @@ def priors_of(problem: RigProblem) -> dict[str, VectorPrior]:
 
 
 def prior_spreads_of(
-    problem: RigProblem, believed: Mapping[str, VectorPrior]
+    problem: RigProblem, believed: Mapping[str, VectorPrior], ignored: Mapping[str, Array] | None = None
 ) -> dict[tuple[str, str], Array]:
-    """For `covariance_of`: what held parameters may really be off by.
+    """For `covariance_of`: what held parameters may really be off by. ignored: by camera, as of `KeptDirections`.
 
     The solver was given `T = P^-1 + X` for a prior of covariance P, X large where a parameter is held. Its scores
     really scatter by `T P T`, which is `X + X P X` more than the T that the information takes them for.
@@ -197,7 +216,8 @@ def prior_spreads_of(
         prior, true = camera.intrinsics_prior, believed.get(camera.name)
         if prior is not None and true is not None and "intrinsics" in camera.free:
             X = prior.information - true.information
-            prior_spreads[(camera.name, "intrinsics")] = X + X @ np.linalg.inv(true.information) @ X
+            held = X + X @ np.linalg.inv(true.information) @ X
+            prior_spreads[(camera.name, "intrinsics")] = held + (ignored or {}).get(camera.name, 0.0)
     return prior_spreads
 
 

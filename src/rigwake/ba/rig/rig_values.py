@@ -107,6 +107,7 @@ class AdjustedRig:
     noise_factors: by camera, how much larger the residuals are than the trackers assumed; the observations'
     `std_px` already contain it. dropped: observations left out as wrong, by camera. intrinsics_priors: by camera, what
     was believed of intrinsics that were estimated; the problem's own priors also hold what the motion does not tell.
+    ignored_intrinsics: by camera, see `KeptDirections`.
     """
 
     solution: RigSolution
@@ -115,3 +116,4 @@ class AdjustedRig:
     noise_factors: Mapping[str, float]
     dropped: Mapping[str, int]
     intrinsics_priors: Mapping[str, VectorPrior] = field(default_factory=dict)
+    ignored_intrinsics: Mapping[str, Array] = field(default_factory=dict)

@@ -55,7 +55,12 @@ def judge_lenses(adjusted: AdjustedRig, believed: Mapping[str, VectorPrior]) -> 
     # nothing was moved, and nothing is to be moved: that is the optimum already
     settled = not _is_free(before.problem) and all(_is_whole(k) for k in kept.values())
     solution = before if settled else solve(_held(free.problem, kept), SETTLED)
-    return replace(adjusted, solution=_judged(solution, kept, believed), intrinsics_priors=believed)
+    return replace(
+        adjusted,
+        solution=_judged(solution, kept, believed),
+        intrinsics_priors=believed,
+        ignored_intrinsics={name: k.ignored for name, k in kept.items()},
+    )
 
 
 def _judged(

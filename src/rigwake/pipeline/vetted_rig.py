@@ -1,0 +1,115 @@
+"""The rig from every camera's own motion, once sensors were compared and lenses that are wrong were mended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rigwake.ba.rig.initialisation import InitialRig
+from rigwake.config import CalibrateConfig
+from rigwake.pipeline.before_start import without_cameras
+from rigwake.pipeline.lens_mending import MendedLenses, mend_lenses, refuse_contradicted, started_from
+from rigwake.pipeline.prior import RigPrior
+from rigwake.pipeline.rig_stage import RigEstimate, estimate_rig, initialise_rig
+from rigwake.pipeline.sensor_checks import VettedSensors, vet_sensors
+from rigwake.pipeline.stream_selection import Selection
+from rigwake.recording import Recording
+from rigwake.tracks import Tracks
+from rigwake.trajectory import Trajectory
+
+_WORDS = "comparing the sensors"
+
+
+@dataclass(frozen=True, eq=False)
+class VettedRig:
+    """own: the trajectories that were used, by camera. first: initial values. vetted: the sensors that were used, and
+    what was said of them."""
+
+    own: Mapping[str, Trajectory]
+    first: InitialRig
+    rig: RigEstimate
+    vetted: VettedSensors
+
+
+def estimate_vetted_rig(
+    recording: Recording,
+    selection: Selection,
+    tracks: Mapping[str, Tracks],
+    trajectories: Mapping[str, Trajectory],
+    config: CalibrateConfig,
+    prior: RigPrior,
+    *,
+    masks: Path,
+    external: bool = False,
+    without_horizon: frozenset[str] = frozenset(),
+    progress: Callable[[str, float], None] = lambda words, fraction: None,
+) -> VettedRig:
+    """Sensors compared, initial values, rig. With intrinsics to refine, lenses that contradict what the cameras saw are
+    given a better start; where the rig then moves a lens by pixels, all that was compared and estimated with the former
+    one is done again.
+
+    tracks, trajectories: by camera. external: whether another odometry made the trajectories, which then stay.
+    without_horizon: see `vet_sensors`. masks: see `estimate_rig`.
+
+    Raises InputError that names a sensor that cannot be right, and as `initialise_rig` and `estimate_rig`.
+    """
+    mended = MendedLenses(selection, tracks, trajectories)
+    odometry = None if external else replace(config.odometry, seed=config.seed)
+    refines = config.intrinsics != "fixed" and config.repair
+    if config.sensor_checks:
+        progress(_WORDS, 0.0)
+        mended = mend_lenses(selection, tracks, trajectories, odometry) if refines else mended
+    # landmarks are not looked for in other cameras before the lenses are known
+    alone = _without_association(config) if mended.moved else config
+    found = _one_pass(recording, mended, alone, prior, masks, without_horizon, progress)
+    if refines:
+        again = started_from(mended, found.rig.lenses, odometry)
+        if mended.moved or again is not mended:
+            found = _one_pass(recording, again, config, prior, masks, without_horizon, progress)
+        refuse_contradicted(again, found.rig.lenses)
+    return found
+
+
+def _without_association(config: CalibrateConfig) -> CalibrateConfig:
+    """The settings without cross-camera association."""
+    return config.model_copy(update={"adjustment": replace(config.adjustment, cross_camera=False)})
+
+
+def _one_pass(
+    recording: Recording,
+    mended: MendedLenses,
+    config: CalibrateConfig,
+    prior: RigPrior,
+    masks: Path,
+    without_horizon: frozenset[str],
+    progress: Callable[[str, float], None],
+) -> VettedRig:
+    vetted = VettedSensors(mended.selection)
+    if config.sensor_checks:
+        progress(_WORDS, 0.0)
+        vetted = vet_sensors(
+            mended.selection,
+            mended.tracks,
+            mended.trajectories,
+            without_horizon=without_horizon,
+            lenses=mended.fits,
+            repair=config.repair,
+        )
+    selection = vetted.selection
+    own = {name: path for name, path in mended.trajectories.items() if name in selection.cameras}
+    prior = without_cameras(prior, mended.selection.cameras.keys() - own.keys())
+    first = initialise_rig(selection, own, config, prior)
+    rig = estimate_rig(
+        recording,
+        selection,
+        mended.tracks,
+        first,
+        config,
+        prior,
+        masks=masks,
+        beliefs=mended.beliefs,
+        progress=progress,
+    )
+    vetted = replace(vetted, checks=(*mended.checks, *vetted.checks))
+    return VettedRig(own, first, rig, vetted)
