@@ -253,7 +253,7 @@ def intrinsics(
         max_angle=None if fov_deg is None else float(np.deg2rad(fov_deg / 2)),
     )
     if out is not None:
-        save_intrinsics(Path(out), name, calibration_to_dict(result, observations.unused, scores))
+        save_intrinsics(Path(out), {name: calibration_to_dict(result, observations.unused, scores)})
     return result
 
 

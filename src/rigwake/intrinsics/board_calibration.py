@@ -266,7 +266,9 @@ class _Information:
         return float(np.sqrt(self.variance * np.sum(along[self.known] ** 2 / self.eigenvalues[self.known])))
 
 
-def _shared_errors(information: _Information, jacobians: Array, residuals_px: Array, corners: Corners) -> float:
+def _shared_errors(
+    information: _Information, jacobians: Array, residuals_px: Array, corners: Corners
+) -> float:
     """How much larger the variance of the camera's parameters is than independent corners make it, at least 1.
 
     The scatter of the scores' sums over views (blur, what the model misses) and over the board's corners (a board
