@@ -15,7 +15,6 @@ from typer.testing import CliRunner
 from rigwake.cameras.models.kannala_brandt import KannalaBrandt4
 from rigwake.cli.main import build_app
 from rigwake.geometry import so3
-from rigwake.report.inspection_page import inspection_page
 from rigwake.inspection.inspection_summary import inspection_to_dict
 from rigwake.inspection.picture_samples import Pictures, camera_rotation
 from rigwake.inspection.readiness import judge
@@ -25,6 +24,7 @@ from rigwake.inspection.timing import timing
 from rigwake.inspection.vessel_motion import levelled_rotations, travel, turning
 from rigwake.readers.open import open_recording
 from rigwake.recording import CameraStream, Frame, GnssStream, ImuStream, Recording
+from rigwake.report.inspection_page import inspection_page
 
 START_NS = 1_700_000_000_000_000_000
 RATE_HZ = 100

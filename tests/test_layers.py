@@ -19,6 +19,7 @@ LAYERS = [
         "workers",
         "kernel_cache",
         "text_files",
+        "extras",
         "yaml_input",
     ],
     ["geometry"],

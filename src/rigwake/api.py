@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from rigwake.errors import InputError, UsageError
+from rigwake.extras import require_extra
 
 if TYPE_CHECKING:
     from rigwake.calibration import Calibration
@@ -384,6 +385,7 @@ def report(
     content = load_report_content(folder)
     page = build_report(content)
     if figures is not None:
+        require_extra("matplotlib", "report", "Writing figures")
         from rigwake.report.figures import write_figures
 
         write_figures(content, Path(figures), figure_format)
@@ -412,6 +414,7 @@ def simulate(
     from rigwake.simulation.scenario import changed_scenario, load_scenario
     from rigwake.simulation.write_simulation import write_simulation
 
+    require_extra("embreex", "sim", "The simulator")
     target = require_recording_target(None if out is None else Path(out))
     chosen = changed_scenario(load_scenario(str(scenario)), duration_s, seed)
     write_simulation(

@@ -33,6 +33,7 @@ from rigwake.cli.options import (
     topic_words,
 )
 from rigwake.errors import PartialResultError, RigwakeError, UsageError
+from rigwake.extras import require_extra
 
 if TYPE_CHECKING:
     from rigwake._types import Image
@@ -103,8 +104,9 @@ def command(
         raise UsageError(
             "--camera reads one recording.", remedy="Give the recording alone, or leave out --camera."
         )
+    if plots is not None:
+        require_extra("matplotlib", "report", "Writing plots")
     from rigwake.atomic import write_text_atomic
-    from rigwake.intrinsics.plots import save_plots
     from rigwake.intrinsics.result_file import save_intrinsics
     from rigwake.pipeline.intrinsics_run import LensChoice
 
@@ -117,7 +119,7 @@ def command(
         save_intrinsics(output, run.contents())
     if html is not None:
         write_text_atomic(html, run.page(images[0].resolve().name))
-    written = [p for n, lens in run.found.items() if plots for p in save_plots(lens.result, plots, n)]
+    written = _plotted(run, plots)
     if json_file is not None:
         write_json(json_file, run.contents())
     if str(json_file) != "-":
@@ -142,6 +144,14 @@ def command(
             ["rigwake", "calibrate", "--help"],
             f"then: calibrate RECORDING --camera-file {escape(str(output))} -o OUT",
         )
+
+
+def _plotted(run: IntrinsicsRun, folder: Path | None) -> list[Path]:
+    if folder is None:
+        return []
+    from rigwake.intrinsics.plots import save_plots
+
+    return [path for name, lens in run.found.items() for path in save_plots(lens.result, folder, name)]
 
 
 class _TopicWords(NamedTuple):

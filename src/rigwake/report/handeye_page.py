@@ -48,13 +48,13 @@ def handeye_page(
     """One HTML page. members: the trajectories that went in beside the reference, by the names in `result`."""
     in_metres = (in_one_unit(reference, member)[0] for member in members)  # as the estimate saw them
     by_name = {m.name: m for m in in_metres if m.name in result.members}
-    determined = [n for n, camera in result.members.items() if camera.has_figures]
-    tone = "lost" if not determined else "usable" if len(determined) < len(result.members) else "good"
+    found = [n for n, camera in result.members.items() if camera.has_figures]
+    tone = "lost" if not found else "usable" if len(found) < len(result.members) else "good"
     open_parts = [f"{d.words}. {d.remedy}" for c in result.members.values() for d in c.unobservable]
     return html_page(
         f"Hand-eye calibration in {result.reference}",
         [
-            verdict(tone, f"{len(determined)} of {len(result.members)} mountings determined", open_parts),
+            verdict(tone, f"{len(found)} of {len(result.members)} mountings determined", open_parts),
             _mountings(result),
             card("Do the clocks agree?", *_speeds(result, reference, by_name)),
             card("Do the motions agree?", *_residuals(result, reference, by_name), listing(_said(checks))),
@@ -199,7 +199,7 @@ def motion_residuals(
 ) -> tuple[np.ndarray, Array] | None:
     """Stamps (N,) of the reference's clock and `log(B^-1 X^-1 A X)` (N, 6) of motions A, B over one second.
 
-    The translation is NaN where the scale of the member's segment is not determined. None where nothing overlaps.
+    The translation is NaN where the scale of the member's segment is unobservable. None where nothing overlaps.
     Along directions that the motion leaves unobservable the raw estimate serves: any value fits there.
     """
     X, shift = result.ref_from_members[member.name], _offset_ns(result.members[member.name])
@@ -232,7 +232,7 @@ def motion_residuals(
 
 
 def _scales(result: HandeyeResult, member: Trajectory) -> Array:
-    """Metres per unit of every segment; NaN where not determined, 1 where none was estimated."""
+    """Metres per unit of every segment; NaN where unobservable, 1 where none was estimated."""
     assert member.segment_ids is not None
     count = int(member.segment_ids.max()) + 1
     found = np.asarray(result.scales[member.name], np.float64).reshape(-1, 2)

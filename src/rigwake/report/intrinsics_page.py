@@ -43,19 +43,19 @@ def intrinsics_page(
 ) -> str:
     """One HTML page. source: what the images came from; failed: reasons of cameras without a result."""
     failed = failed or {}
-    doubts = [f"{name}: {why}" for name, why in failed.items()]
-    doubts += [
+    reservations = [f"{name}: {why}" for name, why in failed.items()]
+    reservations += [
         f"{name}: unobservable by these views: {', '.join(lens.result.unobservable)}."
         for name, lens in lenses.items()
         if lens.result.unobservable
     ]
-    tone = "lost" if not lenses else "usable" if doubts else "good"
+    tone = "lost" if not lenses else "usable" if reservations else "good"
     rows = [_row(name, lens.result) for name, lens in lenses.items()]
     head = ["camera", "model", "size, px", "focal, px", "views", "corners", "RMS, px", "farthest off axis, °"]
     return html_page(
         f"Lenses of {source}",
         [
-            verdict(tone, f"{len(lenses)} of {len(lenses) + len(failed)} lenses calibrated", doubts),
+            verdict(tone, f"{len(lenses)} of {len(lenses) + len(failed)} lenses calibrated", reservations),
             card("Lenses", table("Lenses", head, rows)),
             *(_lens_card(name, lens) for name, lens in lenses.items()),
         ],
@@ -133,7 +133,9 @@ def _corners(name: str, result: IntrinsicCalibration, view: int, image: Image | 
         strict=True,
     ):
         colour = "#56b4e9" if used else "#ff5c5c"
-        overlay.append(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{radius:.1f}" fill="none" stroke="{colour}"/>')
+        overlay.append(
+            f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{radius:.1f}" fill="none" stroke="{colour}" stroke-width="2"/>'
+        )
         overlay.append(f'<path style="stroke:#ffd400" d="M{u:.1f},{v:.1f}l{du:.1f},{dv:.1f}"/>')
     words = (
         f"{result.view_names[view]}: corners as found (circles; red: left out); yellow: residual, 20 times."
@@ -145,13 +147,22 @@ def _undistorted(name: str, result: IntrinsicCalibration, image: Image | None) -
     """What a pinhole would have seen: the lines of the board must be straight."""
     if image is None:
         return Markup("")
-    half = min(result.camera.max_angle, _WIDEST)
+    half = _half_view(result)
     focal = min(axis_focal_px(result.camera), 0.5 * _LARGEST_PX / np.tan(half))
     width = 2 * int(focal * np.tan(half))
     height = max(2, min(width, round(width * result.camera.height_px / result.camera.width_px)))
     view = Pinhole((focal, focal, (width - 1) / 2, (height - 1) / 2, *[0.0] * 6), width, height)
     seen = remap_table(result.camera, view).apply(image)
     return picture(seen, f"Undistorted, {2 * np.rad2deg(half):.0f}° wide: straight lines are straight.")
+
+
+def _half_view(result: IntrinsicCalibration) -> float:
+    """Radians from the axis to the middle of the farther side of the image, as far as a pinhole may show it."""
+    w, h = result.camera.width_px - 1.0, result.camera.height_px - 1.0
+    sides = np.array([[0.0, h / 2], [w, h / 2], [w / 2, 0.0], [w / 2, h]])
+    bearings, seen = result.camera.unproject(sides)
+    angles = np.arccos(np.clip(bearings[seen, 2], -1, 1))
+    return min(float(angles.max()) if len(angles) else result.camera.max_angle, _WIDEST)
 
 
 def _uncertainty(name: str, result: IntrinsicCalibration, image: Image | None) -> Markup:
@@ -197,7 +208,7 @@ def _per_view(result: IntrinsicCalibration) -> Series:
     sums = np.bincount(result.corners.view_index, squares)
     counts = np.bincount(result.corners.view_index, result.corners.used)
     rms: Array = np.sqrt(sums / np.maximum(counts, 1))
-    return Series("", np.arange(1.0, len(rms) + 1), rms)
+    return Series("", np.arange(1.0, len(rms) + 1), rms, is_dots=True)
 
 
 def _over_angle(result: IntrinsicCalibration, most: int = 1500) -> Series:
