@@ -12,6 +12,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+import tutorial_outputs
 from calibrated_rigs import PINHOLE, boat, without_vertical
 from cli_runs import commands_by_words
 from rigwake.calibration import load_calibration, save_calibration
@@ -159,6 +160,15 @@ def commands_of(page: Path) -> list[list[str]]:
     return [shlex.split(line, comments=True)[1:] for line in lines if "..." not in line.split("#")[0]]
 
 
+def test_the_tutorial_shows_what_the_commands_print() -> None:
+    shown = tutorial_outputs.blocks()
+    assert [words[0] for words, _ in shown] == ["inspect", "calibrate", "evaluate"]
+    known = source_text()
+    for _, block in shown:  # sentences of the page are sentences of the program
+        for sentence in re.findall(r"^[a-z]+: ([A-Za-z ]{20,})", block, re.MULTILINE):
+            assert sentence.strip() in known
+
+
 def run_commands(commands: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> str:
     """Run `rigwake ...` one after the other, without opening a browser; what they said."""
     monkeypatch.setattr("webbrowser.open", lambda address: True)
@@ -192,6 +202,10 @@ def test_the_whole_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     commands[again] = ["diff", "OUT/calibration.yaml", "OUT/calibration.yaml"]
     said = run_commands(commands, monkeypatch)
     assert "Enough to calibrate." in said
+    for command, block in tutorial_outputs.blocks():
+        assert tutorial_outputs.words_of(block), command
+        sides = set(tutorial_outputs.words_of(block)) - set(tutorial_outputs.words_of(said))
+        assert not sides, f"{command}: the page says {sides}: python tests/tutorial_outputs.py FOLDER"
     exec(compile(WHOLE_WAY, "docs/python.md", "exec"), {})
     assert set(load_calibration(Path("OUT3/calibration.yaml")).cameras) == {"front", "left"}
     truth = read_true_rig(tmp_path / "harbour_truth" / "truth.yaml")
