@@ -52,7 +52,9 @@ def draw(seed: int, blur_px: float) -> tuple[float, float, int, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--draws", type=int, default=12)
     parser.add_argument("--blur", type=float, default=0.6)
     wanted = parser.parse_args()
@@ -62,7 +64,9 @@ def main() -> None:
         nees, error_px, views, widening = draw(seed, wanted.blur)
         ratios.append(nees)
         print(f"| {seed} | {views} | {error_px:.4f} | {widening:.2f} | {nees:.2f} |", flush=True)
-    print(f"\nmean NEES / dof: {np.mean(ratios):.2f} (honest: 1) +- {np.std(ratios) / np.sqrt(len(ratios)):.2f}")
+    print(
+        f"\nmean NEES / dof: {np.mean(ratios):.2f} (honest: 1) +- {np.std(ratios) / np.sqrt(len(ratios)):.2f}"
+    )
 
 
 if __name__ == "__main__":

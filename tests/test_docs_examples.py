@@ -235,6 +235,7 @@ def test_commands_in_the_documentation_exist() -> None:
 
 def test_every_page_is_in_the_site_and_linked_from_its_start() -> None:
     pages = {page.name for page in (ROOT / "docs").glob("*.md")}
-    assert pages == set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text()))
+    named = set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text()))
+    assert named == pages | {"cli/index.md"}  # which links to a page per verb
     linked = set(re.findall(r"\]\((\w+\.md)\)", (ROOT / "docs" / "index.md").read_text()))
     assert pages - linked == {"index.md"}
