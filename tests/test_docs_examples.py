@@ -65,6 +65,7 @@ def test_the_whole_way_says_what_a_recording_lacks(
 def test_a_notebook_shows_a_table_without_made_up_numbers() -> None:
     rig = without_vertical(boat(), "port")
     assert rig._repr_html_().count("<tr>") == 5
+    assert rig._repr_html_().count("<circle") == len(rig.cameras)
     assert "port: x y z 410.0 ± 4, 830.0 ± 11, unobservable mm" in repr(rig)
     assert "nan" not in rig._repr_html_() + repr(rig)
 

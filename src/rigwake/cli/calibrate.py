@@ -186,9 +186,8 @@ def _print_run(run: CalibrationRun) -> None:
         out.print(f"[dim]note: {escape(note)}[/dim]")
     verdict = judge(run.calibration)
     out.print(f"{verdict.level}: {escape(verdict.sentence)}", soft_wrap=True)
-    for reason in verdict.reasons:
-        if not reason.holds:
-            out.print(f"- {escape(f'{reason.words} {reason.remedy}'.rstrip())}", soft_wrap=True)
+    for against in (reason for reason in verdict.reasons if not reason.holds):
+        out.print(f"- {escape(f'{against.words} {against.remedy}'.rstrip())}", soft_wrap=True)
     out.print(f"written: {escape(f'{run.out}/calibration.yaml, {run.out}/report.html')}", soft_wrap=True)
     next_step(["rigwake", "report", run.out, "--open"], "look at it before you believe it")
 
