@@ -87,9 +87,17 @@ def _aprilgrid_texture(board: Board, x: np.ndarray, y: np.ndarray) -> np.ndarray
 
 
 def render_board(
-    camera: CameraModel, board: Board, cam_from_board: SE3, rng: np.random.Generator, oversample: int = 3
+    camera: CameraModel,
+    board: Board,
+    cam_from_board: SE3,
+    rng: np.random.Generator,
+    oversample: int = 3,
+    blur_px: float = 0.0,
 ) -> np.ndarray:
-    """A grey image (H, W) of the board (its own origin at its centre) before a mid-grey background."""
+    """A grey image (H, W) of the board (its own origin at its centre) before a mid-grey background.
+
+    blur_px: standard deviation of the lens's blur; without it, only the pixels' own area blurs.
+    """
     pixels_per_m = 2000.0
     texture, rim = board_texture(board, pixels_per_m)
     extent = board.corner_points[:, :2].max(axis=0)
@@ -110,5 +118,7 @@ def render_board(
     fine = cv2.remap(
         texture, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=90
     )
+    if blur_px > 0:
+        fine = cv2.GaussianBlur(fine, (0, 0), blur_px * oversample)
     image = cv2.resize(fine, (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA)
     return (image + rng.normal(0, 1.5, image.shape)).clip(0, 255).astype(np.uint8)

@@ -32,7 +32,10 @@ GOOD_CHECKS = {
 }
 PROVENANCE = {
     "inputs": [{"path": "harbour.bag", "sha256": "3f7a"}],
-    "settings": {"front_end": "klt", "cameras": 4},
+    "settings": {
+        "cameras": 4,
+        "tracking": {"front_end": "klt", "nested": {"a_setting_with_a_long_name": None}},
+    },
     "versions": {"rigwake": "0.1.0", "numpy": "2.4"},
 }
 

@@ -123,6 +123,14 @@ USED = [
     ("evaluate {port_tum} --truth {port_tum}", 0, "next:"),
     ("diff {calibration} {calibration} --range 10 --range 50 --json {here}/d.json", 0, "at 50 m"),
     ("diff {calibration} {open}", 0, "next:"),
+    ("diff {calibration} {open} --html {here}/diff.html", 0, "next:"),
+    ("handeye {rig_tum} {port_tum} --html {here}/handeye.html", 0, "next:"),
+    ("intrinsics {corners} --image-size 640x480 --model kb4 --html {here}/lens.html", 0, "written:"),
+    (
+        "intrinsics {images} --camera all --board chessboard:9x6:0.03 --topic camera.front=/a --topics {topics}",
+        1,
+        "no chessboard of 9 x 6 inner corners was found in 4 of its 4 frames",
+    ),
     *(
         (f"export {{calibration}} --to {name} -o {{here}}/exports/{name}", 0, "next:")
         for name in FORMATS

@@ -111,6 +111,13 @@ WRONG = [
     ("intrinsics {images} --board triangle:3x3:1", 2, "board"),
     ("intrinsics {images} --board chessboard:9x6:0.03 --model fisheye", 2, "Choose from pinhole"),
     ("intrinsics {images} --board chessboard:9x6:0.03 --fov 400", 2, "a number above 0 and below 360"),
+    ("intrinsics {images} --camera all", 2, "Images need a board."),
+    ("intrinsics {images} --camera aft --board chessboard:9x6:0.03", 2, "aft"),
+    (
+        "intrinsics {images} {images} --camera all --board chessboard:9x6:0.03",
+        2,
+        "--camera reads one recording.",
+    ),
     ("intrinsics {corners}", 2, "needs the image size."),
     ("intrinsics {corners} --image-size big", 2, "is not WIDTHxHEIGHT."),
     ("intrinsics {corners} --image-size 0x0", 2, "is not WIDTHxHEIGHT."),

@@ -13,6 +13,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+import tutorial_outputs
 from calibrated_rigs import PINHOLE, boat, without_vertical
 from cli_runs import commands_by_words
 from rigwake.calibration import load_calibration, save_calibration
@@ -65,6 +66,7 @@ def test_the_whole_way_says_what_a_recording_lacks(
 def test_a_notebook_shows_a_table_without_made_up_numbers() -> None:
     rig = without_vertical(boat(), "port")
     assert rig._repr_html_().count("<tr>") == 5
+    assert rig._repr_html_().count("<circle") == len(rig.cameras)
     assert "port: x y z 410.0 ± 4, 830.0 ± 11, unobservable mm" in repr(rig)
     assert "nan" not in rig._repr_html_() + repr(rig)
 
@@ -168,6 +170,15 @@ def commands_of(page: Path) -> list[list[str]]:
     return [shlex.split(line, comments=True)[1:] for line in lines if "..." not in line.split("#")[0]]
 
 
+def test_the_tutorial_shows_what_the_commands_print() -> None:
+    shown = tutorial_outputs.blocks()
+    assert [words[0] for words, _ in shown] == ["inspect", "calibrate", "evaluate"]
+    known = source_text()
+    for _, block in shown:  # sentences of the page are sentences of the program
+        for sentence in re.findall(r"^[a-z]+: ([A-Za-z ]{20,})", block, re.MULTILINE):
+            assert sentence.strip() in known
+
+
 def run_commands(commands: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> str:
     """Run `rigwake ...` one after the other, without opening a browser; what they said."""
     monkeypatch.setattr("webbrowser.open", lambda address: True)
@@ -201,6 +212,10 @@ def test_the_whole_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     commands[again] = ["diff", "OUT/calibration.yaml", "OUT/calibration.yaml"]
     said = run_commands(commands, monkeypatch)
     assert "Enough to calibrate." in said
+    for command, block in tutorial_outputs.blocks():
+        assert tutorial_outputs.words_of(block), command
+        sides = set(tutorial_outputs.words_of(block)) - set(tutorial_outputs.words_of(said))
+        assert not sides, f"{command}: the page says {sides}: python tests/tutorial_outputs.py FOLDER"
     exec(compile(WHOLE_WAY, "docs/python.md", "exec"), {})
     assert set(load_calibration(Path("OUT3/calibration.yaml")).cameras) == {"front", "left"}
     truth = read_true_rig(tmp_path / "harbour_truth" / "truth.yaml")
@@ -231,7 +246,8 @@ def test_commands_in_the_documentation_exist() -> None:
 def test_every_page_is_in_the_site_and_linked_from_its_start() -> None:
     docs = ROOT / "docs"
     pages = {page.relative_to(docs).as_posix() for page in docs.rglob("*.md")}
-    assert pages == set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text()))
+    named = set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text()))
+    assert pages == named | {page for page in pages if page.startswith("cli/")}  # its index links to a page per verb
     linked = set(re.findall(r"\]\(([\w/]+\.md)\)", (docs / "index.md").read_text()))
     assert {page for page in pages if "/" not in page} - linked == {"index.md"}
     assert {"reference/api.md", "measurements/index.md"} <= linked  # the ways to pages made by programs

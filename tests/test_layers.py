@@ -22,6 +22,7 @@ LAYERS = [
         "workers",
         "kernel_cache",
         "text_files",
+        "extras",
         "yaml_input",
     ],
     ["geometry"],

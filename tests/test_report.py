@@ -26,6 +26,7 @@ from rigwake.report.extrinsics import directions, looks, two_digits
 from rigwake.report.figures import write_figures
 from rigwake.report.motion_figures import motion_of, paths_in_one_world
 from rigwake.report.picture_overlays import BUDGET_BYTES
+from rigwake.report.report_page import render
 from rigwake.report.report_verdict import judge
 from rigwake.report.rerun_log import log_to_rerun
 
@@ -317,6 +318,13 @@ def test_the_verb_rebuilds_the_page(folder: Path, tmp_path: Path) -> None:
     assert "GOOD" in done.output
     assert (folder / "report.html").is_file()
     assert len(list((tmp_path / "figures").iterdir())) == 5
+
+
+def test_the_head_says_which_recording_and_how_long(folder: Path) -> None:
+    page = render(load_report_content(folder))
+    assert "harbour.bag" in page.partition("</header>")[0]
+    assert "Observations behind each point" in page
+    assert "Intrinsics used" in page
 
 
 def test_rerun_recording(folder: Path, tmp_path: Path) -> None:

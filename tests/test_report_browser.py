@@ -1,7 +1,6 @@
 """The report in a real browser: Debian's chromium, driven headless."""
 
 import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,29 +9,15 @@ import numpy as np
 import pytest
 
 from calibrated_rigs import boat, without_vertical
+from headless_browser import headless_browser, requests_of, serious_findings
+from headless_browser import open_page as open_plainly
 from report_folders import write_folder
 from rigwake.report import build_report
 
-webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-from selenium.webdriver.chrome.options import Options  # noqa: E402
-from selenium.webdriver.chrome.service import Service  # noqa: E402
-from selenium.webdriver.common.by import By  # noqa: E402
-from selenium.webdriver.common.keys import Keys  # noqa: E402
+By = pytest.importorskip("selenium.webdriver.common.by", reason="selenium is not installed").By
+Keys = pytest.importorskip("selenium.webdriver.common.keys").Keys
 
 TABS = ["rig", "extrinsics", "uncertainty", "residuals", "checks", "motion", "settings"]
-AXE = Path(__file__).parent.parent / ".venv" / "axe" / "node_modules" / "axe-core" / "axe.min.js"
-FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--window-size=1280,1000",
-)
-
 pytestmark = pytest.mark.slow
 
 
@@ -46,37 +31,17 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator:
-    binary, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if binary is None or driver is None:
-        pytest.skip("chromium and chromium-driver are not installed")
-    options = Options()
-    options.binary_location = binary
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    session = webdriver.Chrome(options=options, service=Service(driver))
-    yield session
-    session.quit()
+    with headless_browser(tmp_path_factory.mktemp("profile")) as session:
+        yield session
 
 
 def open_page(browser, page: Path, width: int = 1280, dark: bool = False) -> None:
-    metrics = {"width": width, "height": 1000, "deviceScaleFactor": 1, "mobile": width < 500}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
-    scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "", "features": [scheme]})
-    browser.get(page.as_uri())
+    open_plainly(browser, page, width, dark)
     assert browser.execute_script("return document.documentElement.dataset.ready") == "yes"
 
 
 def show(browser, tab: str) -> None:
     browser.find_element(By.ID, f"tab-{tab}").click()
-
-
-def requests_of(browser) -> set[str]:
-    """Addresses that were asked for."""
-    messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
-    sent = [m["params"] for m in messages if m["method"] == "Network.requestWillBeSent"]
-    return {m["request"]["url"] for m in sent if not m["request"]["url"].startswith("data:")}
 
 
 def test_no_errors_no_requests_and_quick(browser, pages: dict[str, Path]) -> None:
@@ -211,17 +176,7 @@ def test_without_scripts_everything_is_there(browser, pages: dict[str, Path]) ->
 
 @pytest.mark.parametrize(("name", "dark"), [("good", False), ("lost", True)], ids=["light", "dark"])
 def test_accessibility(browser, pages: dict[str, Path], name: str, dark: bool) -> None:
-    if not AXE.is_file():
-        pytest.skip("axe-core is not installed: npm install --prefix .venv/axe axe-core")
     open_page(browser, pages[name], dark=dark)
-    browser.execute_script(AXE.read_text())
     for tab in TABS:
         show(browser, tab)
-        run = "const done = arguments[0]; axe.run(document).then((r) => done(r.violations), (e) => done(String(e)))"
-        violations = browser.execute_async_script(run)
-        serious = [
-            (v["id"], v["impact"], v["nodes"][0]["html"][:150])
-            for v in violations
-            if v["impact"] in ("serious", "critical")
-        ]
-        assert serious == [], tab
+        assert serious_findings(browser) == [], tab

@@ -14,7 +14,7 @@ from rigwake.errors import InputError, RigwakeError, UsageError
 from rigwake.recording import CameraStream, Recording
 from rigwake.views.frames import FrameWatch, frame_sets, require_fit
 from rigwake.views.stills import ImageFrames
-from view_scenes import HEIGHT_M, PLACES, attitude, four_cameras, photograph, water_and_ring
+from view_scenes import HEIGHT_M, PLACES, attitude, four_cameras, photograph, water_and_ring, write_rig
 
 RIG = four_cameras()
 PERIOD = 10**8
@@ -30,21 +30,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cv2.imwrite(str(folder / "pictures" / f"{name}.png"), image)
     write_rig(folder / "rig.yaml")
     return folder
-
-
-def write_rig(path: Path, names: dict[str, str] | None = None, width: int = 640) -> None:
-    lines = ["reference: base_link", "cameras:"]
-    for index, name in enumerate(RIG.names):
-        place = RIG.rig_from_cam[index]
-        params = dict(zip(RIG.models[index].param_names, RIG.models[index].params.tolist(), strict=True))
-        lines += [
-            f"  {(names or {}).get(name, name)}:",
-            f"    camera: {{model: kb4, width_px: {width}, height_px: 480, params: {json.dumps(params)}}}",
-            "    rig_from_cam:",
-            f"      quat_wxyz: {place.quat_wxyz.tolist()}",
-            f"      translation_m: {place.translation.tolist()}",
-        ]
-    path.write_text("\n".join(lines))
 
 
 def surround(*arguments: object) -> tuple[str, RigwakeError | None]:

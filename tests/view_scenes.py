@@ -1,6 +1,8 @@
 """A rig of four fisheyes above a patterned world, drawn exactly: for tests of the views."""
 
+import json
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -102,3 +104,20 @@ def _noise(x: Array, y: Array) -> Array:
     top = at(i, j) * (1 - fx) + at(i, j + 1) * fx
     bottom = at(i + 1, j) * (1 - fx) + at(i + 1, j + 1) * fx
     return np.asarray(top * (1 - fy) + bottom * fy)
+
+
+def write_rig(path: Path, names: dict[str, str] | None = None, width: int = 640) -> None:
+    """The file of `four_cameras`; names: other names of its cameras."""
+    rig = four_cameras()
+    lines = ["reference: base_link", "cameras:"]
+    for index, name in enumerate(rig.names):
+        place = rig.rig_from_cam[index]
+        params = dict(zip(rig.models[index].param_names, rig.models[index].params.tolist(), strict=True))
+        lines += [
+            f"  {(names or {}).get(name, name)}:",
+            f"    camera: {{model: kb4, width_px: {width}, height_px: 480, params: {json.dumps(params)}}}",
+            "    rig_from_cam:",
+            f"      quat_wxyz: {place.quat_wxyz.tolist()}",
+            f"      translation_m: {place.translation.tolist()}",
+        ]
+    path.write_text("\n".join(lines))

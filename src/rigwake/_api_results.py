@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from rigwake._api_inputs import FilePath, calibration_of, trajectory_of
 from rigwake.errors import UsageError
+from rigwake.extras import require_extra
 
 if TYPE_CHECKING:
     from rigwake.calibration import Calibration
@@ -114,6 +115,7 @@ def report(
     content = load_report_content(folder)
     page = build_report(content)
     if figures is not None:
+        require_extra("matplotlib", "report", "Writing figures")
         from rigwake.report.figures import write_figures
 
         write_figures(content, Path(figures), figure_format)

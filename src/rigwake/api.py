@@ -23,6 +23,7 @@ from rigwake._api_inputs import (
 )
 from rigwake._api_results import diff, evaluate, export, report
 from rigwake._progress import Progress
+from rigwake.extras import require_extra
 
 if TYPE_CHECKING:
     from rigwake.calibration import Calibration
@@ -236,7 +237,7 @@ def intrinsics(
         max_angle=None if fov_deg is None else float(np.deg2rad(fov_deg / 2)),
     )
     if out is not None:
-        save_intrinsics(Path(out), name, calibration_to_dict(result, observations.unused, scores))
+        save_intrinsics(Path(out), {name: calibration_to_dict(result, observations.unused, scores)})
     return result
 
 
@@ -289,6 +290,7 @@ def simulate(
     from rigwake.simulation.scenario import changed_scenario, load_scenario
     from rigwake.simulation.write_simulation import write_simulation
 
+    require_extra("embreex", "sim", "The simulator")
     target = require_recording_target(None if out is None else Path(out))
     chosen = changed_scenario(load_scenario(str(scenario)), duration_s, seed)
     write_simulation(

@@ -43,7 +43,7 @@ def as_text(calibration: Calibration) -> str:
 
 
 def as_html(calibration: Calibration) -> str:
-    """A table; names are escaped."""
+    """A table and a picture from above; names are escaped."""
     head = "".join(
         f"<th>{h}</th>" for h in ("camera", "x, mm", "y, mm", "z, mm", "largest rotation std, deg")
     )
@@ -54,4 +54,37 @@ def as_html(calibration: Calibration) -> str:
         for name, camera in calibration.cameras.items()
     )
     caption = f"<caption>cameras in the frame {escape(calibration.reference)}</caption>"
-    return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{_from_above(calibration)}"
+
+
+_SIDE_PX = 260.0
+
+
+def _from_above(calibration: Calibration) -> str:
+    """A small picture: cameras from above as dots, lines to where they look; x to the right, y up, a cross at the
+    origin. Cameras whose place is unobservable are left out; empty without any."""
+    placed = {
+        name: camera.rig_from_cam
+        for name, camera in calibration.cameras.items()
+        if np.isfinite(camera.rig_from_cam.translation[:2]).all()
+    }
+    if not placed:
+        return ""
+    points = np.array([x.translation[:2] for x in placed.values()])
+    reach = max(float(np.abs(points).max()), 0.1)
+    scale, middle = 0.36 * _SIDE_PX / reach, _SIDE_PX / 2
+    parts = [f'<path d="M{middle - 5},{middle}h10M{middle},{middle - 5}v10"/>']
+    for name, x in placed.items():
+        u, v = middle + scale * x.translation[0], middle - scale * x.translation[1]
+        parts.append(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="3" fill="currentColor"/>')
+        parts.append(
+            f'<text x="{u + 5:.1f}" y="{v - 5:.1f}" fill="currentColor" stroke="none">{escape(name)}</text>'
+        )
+        ahead = x.rotation[:2, 2]
+        if np.isfinite(ahead).all():
+            parts.append(f'<path d="M{u:.1f},{v:.1f}l{28 * ahead[0]:.1f},{-28 * ahead[1]:.1f}"/>')
+    words = "cameras from above, lines to where they look"
+    return (
+        f'<svg width="{_SIDE_PX:.0f}" height="{_SIDE_PX:.0f}" viewBox="0 0 {_SIDE_PX:.0f} {_SIDE_PX:.0f}" role="img" '
+        f'aria-label="{words}" stroke="currentColor" font-size="11" font-family="sans-serif">{"".join(parts)}</svg>'
+    )

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from rigwake.cli.console import figures_table, next_step, out, print_title, progress_bars, write_json
+from rigwake.cli.console import (
+    figures_table,
+    next_step,
+    out,
+    print_looks,
+    print_title,
+    progress_bars,
+    write_json,
+)
 from rigwake.cli.options import (
     AllowPartialOption,
     CameraFileOption,
@@ -162,6 +170,8 @@ def _on_cluster(scheduler: str) -> dict[str, Any]:
 
 def _print_run(run: CalibrationRun) -> None:
     """The rig, what was given up and noted, what was written, what to do next."""
+    from rigwake.report.report_verdict import judge
+
     if run.is_partial:
         out.print(f"[bold red]{escape(_headline(run))}[/bold red]")
     print_calibration(run.calibration)
@@ -174,6 +184,10 @@ def _print_run(run: CalibrationRun) -> None:
             out.print(f"[dim]note: {escape(check.sentence)}[/dim]", soft_wrap=True)
     for note in run.notes:
         out.print(f"[dim]note: {escape(note)}[/dim]")
+    verdict = judge(run.calibration)
+    out.print(f"{verdict.level}: {escape(verdict.sentence)}", soft_wrap=True)
+    for against in (reason for reason in verdict.reasons if not reason.holds):
+        out.print(f"- {escape(f'{against.words} {against.remedy}'.rstrip())}", soft_wrap=True)
     out.print(f"written: {escape(f'{run.out}/calibration.yaml, {run.out}/report.html')}", soft_wrap=True)
     next_step(["rigwake", "report", run.out, "--open"], "look at it before you believe it")
 
@@ -219,6 +233,7 @@ def print_calibration(calibration: Calibration) -> None:
         table.add_row(escape(name), *cells, rotation, time_offset, "–" if apart is None else f"{apart:.1f}")
     print_title(f"cameras in {calibration.reference}, ± one sigma")
     out.print(table)
+    print_looks(calibration)
     if halves:
         out.print("[dim]deg: rotation, worst axis; halves: difference of both halves in sigmas[/dim]")
     for camera in calibration.cameras.values():

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderableType, RenderHook, RenderResult
 from rich.markup import escape
@@ -21,6 +21,9 @@ from rich.table import Table
 
 from rigwake.atomic import write_text_atomic
 from rigwake.errors import RigwakeError
+
+if TYPE_CHECKING:
+    from rigwake.calibration import Calibration
 
 # what could move the cursor, colour the terminal, or turn the direction of writing: shown, not done
 _CONTROLS = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"}
@@ -215,3 +218,14 @@ def progress_bars() -> Iterator[ProgressBars]:
     """Progress of things done at the same time, on stderr: bars that are gone when done, or plain lines."""
     with _progress(TextColumn("{task.percentage:.0f} %")) as progress:
         yield ProgressBars(progress)
+
+
+def print_looks(calibration: Calibration) -> None:
+    """Where every camera looks, one line each; nothing where the axes of the reference have no known meaning."""
+    from rigwake.report.extrinsics import looks
+
+    words = {name: looks(camera, calibration.reference) for name, camera in calibration.cameras.items()}
+    width = max(map(len, words), default=0)
+    for name, where in words.items():
+        if where:
+            out.print(f"{name:<{width}}  looks {where}", markup=False, highlight=False, soft_wrap=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from rigwake.cli.console import err, figures_table, next_step, out, print_title, write_json
+from rigwake.cli.console import err, figures_table, next_step, out, print_looks, print_title, write_json
 from rigwake.cli.options import JsonOption, completed_from, require, require_there, require_writable
 from rigwake.errors import UnobservableError
 
@@ -278,6 +278,9 @@ def _print(result: HandeyeResult) -> None:
     out.print(mountings)
     if others.row_count:
         out.print(others)
+    print_looks(result.calibration())
+    found = sum(camera.has_figures for camera in result.members.values())
+    out.print(f"{found} of {len(result.members)} mountings determined", highlight=False)
     out.print(f"noise: {result.noise}; {result.steps} steps, {result.down_weighted} down-weighted")
     for camera in result.members.values():
         for d in camera.unobservable:

@@ -2,34 +2,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
-from rigwake.cli.console import figures_table, next_step, out, print_title, progress_bar, write_json
+from rigwake.cli.console import (
+    err,
+    figures_table,
+    next_step,
+    out,
+    print_title,
+    progress_bar,
+    progress_bars,
+    write_json,
+)
 from rigwake.cli.options import (
     LENS_MODELS,
     JsonOption,
+    TopicOption,
+    TopicsOption,
     completed_from,
     require,
     require_number,
     require_there,
     require_writable,
+    topic_words,
 )
-from rigwake.errors import UsageError
+from rigwake.errors import PartialResultError, RigwakeError, UsageError
+from rigwake.extras import require_extra
 
 if TYPE_CHECKING:
+    from rigwake._types import Image
     from rigwake.intrinsics.board_calibration import IntrinsicCalibration
     from rigwake.intrinsics.board_observations import BoardObservations
+    from rigwake.intrinsics.boards import Board
     from rigwake.intrinsics.select import ModelScore
+    from rigwake.pipeline.intrinsics_run import IntrinsicsRun, LensChoice
 
 
 def command(
     images: Annotated[
-        list[Path], typer.Argument(help="Images, folders of images, or one csv file of detected corners.")
+        list[Path],
+        typer.Argument(
+            help="Images, folders of images, one csv file of detected corners; or, with --camera, a recording."
+        ),
     ],
     board: Annotated[
         str | None,
@@ -44,6 +64,12 @@ def command(
             autocompletion=completed_from((*LENS_MODELS, "auto")),
         ),
     ] = "auto",
+    camera: Annotated[
+        str | None,
+        typer.Option(help="Of a recording: the name of a camera, or all of them in one file: `all`."),
+    ] = None,
+    topic: TopicOption = None,
+    topics: TopicsOption = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--out", "--output", help="Write the camera file here.")
     ] = None,
@@ -54,55 +80,129 @@ def command(
     ] = None,
     fix: Annotated[str, typer.Option(help="Parameters to hold, comma-separated: `skew,k3`.")] = "",
     free: Annotated[str, typer.Option(help="Parameters to estimate though they are held by default.")] = "",
+    html: Annotated[
+        Path | None,
+        typer.Option(help="Write one HTML page: corners, residuals, uncertainty over the picture."),
+    ] = None,
     plots: Annotated[Path | None, typer.Option(help="Folder for the coverage and residual plots.")] = None,
     json_file: JsonOption = None,
 ) -> None:
     """A camera's lens from images of a board, for pinholes and for fisheyes beyond 180 degrees.
 
     Example: [cyan]rigwake intrinsics images/ --board aprilgrid:6x6:0.088:0.3 --model kb4 -o front.yaml[/cyan]
+
+    Example: [cyan]rigwake intrinsics board.bag --camera all --board chessboard:9x6:0.03 -o lenses.yaml[/cyan]
     """
-    require_there(*images)
+    require_there(*images, topics)
     require("--model", model, (*LENS_MODELS, "auto"))
     require_number("--fov", fov, above=0.0, below=360.0)
     require_writable("-o", output)
+    require_writable("--html", html)
     require_writable("--plots", plots, folder=True)
     require_writable("--json", json_file)
-    import numpy as np
+    if camera is not None and len(images) > 1:
+        raise UsageError(
+            "--camera reads one recording.", remedy="Give the recording alone, or leave out --camera."
+        )
+    if plots is not None:
+        require_extra("matplotlib", "report", "Writing plots")
+    from rigwake.atomic import write_text_atomic
+    from rigwake.intrinsics.result_file import save_intrinsics
+    from rigwake.pipeline.intrinsics_run import LensChoice
 
-    from rigwake.intrinsics.board_calibration import calibrate
-    from rigwake.intrinsics.plots import save_plots
-    from rigwake.intrinsics.result_file import calibration_to_dict, save_intrinsics
-    from rigwake.intrinsics.select import choose
-
-    camera_name = name or (output.stem if output else "camera")
-    observations = _observe(images, board, image_size)
-    scores = _compare(observations) if model == "auto" else []
-    result = calibrate(
-        observations,
-        choose(scores) if model == "auto" else model,
-        fix=_names(fix),
-        free=_names(free),
-        max_angle=None if fov is None else float(np.deg2rad(fov / 2)),
-    )
-    content = calibration_to_dict(result, observations.unused, scores)
-    if output is not None:
-        save_intrinsics(output, camera_name, content)
-    written = save_plots(result, plots, camera_name) if plots is not None else []
+    choice = LensChoice(model, _names(fix), _names(free), fov)
+    if camera is not None:
+        run = _of_recording(images[0], camera, _TopicWords(topic, topics), _board_named(board), choice)
+    else:
+        run = _of_images(images, board, image_size, name or (output.stem if output else "camera"), choice)
+    if output is not None and run.found:
+        save_intrinsics(output, run.contents())
+    if html is not None:
+        write_text_atomic(html, run.page(images[0].resolve().name))
+    written = _plotted(run, plots)
     if json_file is not None:
-        write_json(json_file, {camera_name: content})
-        if str(json_file) == "-":
-            return
-    _print(result, observations, scores)
-    for path in [*([output] if output else []), *written]:
-        out.print(f"written: {escape(str(path))}", soft_wrap=True)
+        write_json(json_file, run.contents())
+    if str(json_file) != "-":
+        for camera_name, lens in run.found.items():
+            _print(camera_name, lens.result, lens.observations, lens.scores)
+        for path in [p for p in (output if run.found else None, html, *written) if p]:
+            out.print(f"written: {escape(str(path))}", soft_wrap=True)
+    _refuse_missing(run.failed, len(run.found))
+    if str(json_file) == "-":
+        return
     if output is None:
         words = _words_again(images, board, image_size, fov, fix, free)
-        next_step([*words, "--model", result.camera.model, "-o", f"{camera_name}.yaml"], "write it to a file")
+        words += ["--camera", camera, *topic_words(topic, topics)] if camera is not None else []
+        models = {lens.result.camera.model for lens in run.found.values()}
+        file = "lenses.yaml" if camera is not None else f"{next(iter(run.found))}.yaml"
+        next_step(
+            [*words, "--model", models.pop() if len(models) == 1 else "auto", "-o", file],
+            "write it to a file",
+        )
     else:
         next_step(
             ["rigwake", "calibrate", "--help"],
             f"then: calibrate RECORDING --camera-file {escape(str(output))} -o OUT",
         )
+
+
+def _plotted(run: IntrinsicsRun, folder: Path | None) -> list[Path]:
+    if folder is None:
+        return []
+    from rigwake.intrinsics.plots import save_plots
+
+    return [path for name, lens in run.found.items() for path in save_plots(lens.result, folder, name)]
+
+
+class _TopicWords(NamedTuple):
+    """--topic and --topics as they were given."""
+
+    topic: list[str] | None
+    topics: Path | None
+
+
+def _of_images(
+    images: list[Path], board: str | None, image_size: str | None, name: str, choice: LensChoice
+) -> IntrinsicsRun:
+    """One camera's lens from pictures or a file of corners."""
+    from rigwake.intrinsics.select import CANDIDATES
+    from rigwake.pipeline.intrinsics_run import IntrinsicsRun, lens_of
+
+    observations, load = _observe(images, board, image_size)
+    if choice.model != "auto":
+        return IntrinsicsRun({name: lens_of(observations, choice, load)})
+    with progress_bar() as bar:
+        task = bar.add_task("comparing models (the first run compiles them)", total=len(CANDIDATES))
+        return IntrinsicsRun({name: lens_of(observations, choice, load, lambda: bar.advance(task))})
+
+
+def _of_recording(
+    recording: Path, camera: str, given: _TopicWords, board: Board, choice: LensChoice
+) -> IntrinsicsRun:
+    """Lenses of one camera of a recording, or of all."""
+    from rigwake.pipeline.intrinsics_run import lenses_of_recording
+    from rigwake.pipeline.odometry_run import cameras_named
+    from rigwake.readers.open import open_recording
+    from rigwake.readers.topics import TopicMap
+
+    opened = open_recording(recording, TopicMap.from_options(given.topic or (), given.topics))
+    with progress_bars() as bars:
+        return lenses_of_recording(cameras_named(opened, camera), board, choice, bars)
+
+
+def _refuse_missing(failed: Mapping[str, RigwakeError], found: int) -> None:
+    """Raises the reason where there is no lens at all, PartialResultError where some cameras have none."""
+    if not failed:
+        return
+    if not found:
+        raise next(iter(failed.values()))
+    for name, error in failed.items():
+        err.print(f"[yellow]{escape(name)}: {escape(str(error))}[/yellow]", soft_wrap=True)
+    raise PartialResultError(
+        f"{len(failed)} of {found + len(failed)} cameras have no lens: {', '.join(failed)}.",
+        consequence="The file holds the others.",
+        remedy="See the reasons above.",
+    )
 
 
 def _words_again(
@@ -114,26 +214,35 @@ def _words_again(
     return ["rigwake", "intrinsics", *images, *given]
 
 
-def _names(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
-def _observe(images: list[Path], board: str | None, image_size: str | None) -> BoardObservations:
-    from rigwake.intrinsics.board_observations import read_corner_file
+def _board_named(board: str | None) -> Board:
     from rigwake.intrinsics.boards import parse_board
+
+    if board is None:
+        raise UsageError("Images need a board.", remedy="Add --board, as chessboard:9x6:0.03.")
+    return parse_board(board)
+
+
+def _observe(
+    images: list[Path], board: str | None, image_size: str | None
+) -> tuple[BoardObservations, Callable[[str], Image | None]]:
+    """Views of the board, and what loads the image of a view."""
+    from rigwake.intrinsics.board_observations import read_corner_file
     from rigwake.intrinsics.detect import detect_board, list_images
+    from rigwake.pipeline.intrinsics_run import image_loader
 
     if any(path.name.endswith((".csv", ".csv.gz")) for path in images):
         if len(images) > 1:
             raise UsageError("One csv file of corners is read at a time.")
         width_px, height_px = _size(image_size)
-        return read_corner_file(images[0], width_px, height_px)
-    if board is None:
-        raise UsageError("Images need a board.", remedy="Add --board, as chessboard:9x6:0.03.")
-    parsed, files = parse_board(board), list_images(images)
+        return read_corner_file(images[0], width_px, height_px), image_loader([])
+    parsed, files = _board_named(board), list_images(images)
     with progress_bar() as bar:
         task = bar.add_task(f"looking for the {parsed.words}", total=len(files))
-        return detect_board(parsed, files, progress=lambda: bar.advance(task))
+        return detect_board(parsed, files, progress=lambda: bar.advance(task)), image_loader(files)
 
 
 def _size(text: str | None) -> tuple[int, int]:
@@ -148,15 +257,9 @@ def _size(text: str | None) -> tuple[int, int]:
     return width_px, height_px
 
 
-def _compare(observations: BoardObservations) -> list[ModelScore]:
-    from rigwake.intrinsics.select import CANDIDATES, cross_validate
-
-    with progress_bar() as bar:
-        task = bar.add_task("comparing models (the first run compiles them)", total=len(CANDIDATES))
-        return cross_validate(observations, progress=lambda: bar.advance(task))
-
-
-def _print(result: IntrinsicCalibration, observations: BoardObservations, scores: list[ModelScore]) -> None:
+def _print(
+    camera: str, result: IntrinsicCalibration, observations: BoardObservations, scores: Sequence[ModelScore]
+) -> None:
     import numpy as np
 
     if scores:
@@ -169,7 +272,7 @@ def _print(result: IntrinsicCalibration, observations: BoardObservations, scores
                 ("–", "–") if score.failure else (f"{score.held_out_px:.4f}", f"{score.std_error_px:.4f}")
             )
             table.add_row(score.model, *figures, str(score.free_count), chosen)
-        print_title("cross-validation: held-out views")
+        print_title(f"{camera}, cross-validation: held-out views")
         out.print(table)
     size = f"{result.camera.width_px} x {result.camera.height_px} px"
     table = figures_table(("parameter", "value", "± 1 sigma"))
@@ -178,7 +281,7 @@ def _print(result: IntrinsicCalibration, observations: BoardObservations, scores
             "held" if parameter in result.fixed else f"{std:.3g}" if np.isfinite(std) else "unobservable"
         )
         table.add_row(parameter, f"{value:.8g}" if np.isfinite(std) else "–", uncertainty)
-    print_title(f"{result.camera.model}, {size}")
+    print_title(f"{camera}: {result.camera.model}, {size}")
     out.print(table)
     out.print(
         f"{result.corners.used.sum()} corners in {len(result.view_names)} views to "

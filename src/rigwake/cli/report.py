@@ -9,6 +9,7 @@ import typer
 
 from rigwake.cli.console import next_step, out
 from rigwake.cli.options import completed_from, require, require_there, require_writable
+from rigwake.extras import require_extra
 
 
 def command(
@@ -43,6 +44,7 @@ def command(
         out.print(line, markup=False, highlight=False, soft_wrap=True)
     out.print(f"\n{path}: {path.stat().st_size / 1e6:.1f} MB", markup=False, highlight=False)
     if figures is not None:
+        require_extra("matplotlib", "report", "Writing figures")
         from rigwake.report.figures import write_figures
 
         for file in write_figures(content, figures, figure_format):

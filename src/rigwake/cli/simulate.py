@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from rigwake.cli.console import next_step, out, progress_bar
 from rigwake.cli.options import PRESETS, completed_from, require_number, require_writable
+from rigwake.extras import require_extra
 from rigwake.simulation.recording_target import require_recording_target
 
 
@@ -57,6 +58,7 @@ def command(
         print(yaml.safe_dump(chosen.model_dump(mode="json", exclude_none=True), sort_keys=False), end="")
         return
     assert output is not None
+    require_extra("embreex", "sim", "The simulator")
     truth_folder = output.parent / f"{output.stem}_truth"
     from rigwake.simulation.write_simulation import write_simulation
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +48,10 @@ def calibration_to_dict(
     return {**camera_to_dict(result.camera), "calibration": calibration}
 
 
-def save_intrinsics(path: Path, name: str, content: dict[str, Any]) -> None:
-    """Write the camera file of one calibrated camera, atomically."""
+def save_intrinsics(path: Path, contents: Mapping[str, dict[str, Any]]) -> None:
+    """Write the camera file of the calibrated cameras, by name, atomically."""
     body = yaml.safe_dump(
-        {"cameras": {name: content}}, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True
+        {"cameras": dict(contents)}, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True
     )
     write_text_atomic(path, HEADER + body)
 

@@ -14,6 +14,8 @@ from rigwake import __version__
 from rigwake._types import Image
 from rigwake.report.charts import COLOURS
 
+CLOCKS_ARE_SET_NS = 946_684_800_000_000_000
+"""2000: stamps before it count from the start of some computer and are no dates."""
 _WIDTH_PX, _QUALITY = 640, 78
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 

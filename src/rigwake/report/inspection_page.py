@@ -15,6 +15,7 @@ from rigwake.inspection.timing import periods_s
 from rigwake.recording import main_gnss
 from rigwake.report.charts import Series, line_chart, top_view
 from rigwake.report.html_page import (
+    CLOCKS_ARE_SET_NS,
     card,
     figure,
     grid,
@@ -30,7 +31,6 @@ from rigwake.report.html_page import (
 from rigwake.report.strip_charts import interval_chart, presence_chart
 
 _MAX_POINTS = 1500  # of one curve
-_CLOCKS_ARE_SET_NS = 946_684_800_000_000_000  # 2000: stamps before count from the start of some computer
 _TONES = {"enough": "good", "partly": "usable", "not enough": "lost"}
 _PASSED = {True: "yes", False: "no", None: "cannot tell"}
 
@@ -60,7 +60,7 @@ def _when(inspection: Inspection) -> str:
     start, end = _span_ns(inspection)
     if end <= start:
         return ""
-    if start < _CLOCKS_ARE_SET_NS:
+    if start < CLOCKS_ARE_SET_NS:
         return f"{(end - start) * 1e-9:.1f} s; its stamps are no dates."
     began = np.datetime64(start, "ns").astype("datetime64[s]")
     return f"{str(began).replace('T', ' ')} UTC by its own stamps, {(end - start) * 1e-9:.1f} s."

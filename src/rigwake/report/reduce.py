@@ -80,7 +80,7 @@ def summarise_residuals(arrays: Mapping[str, np.ndarray], lens: CameraModel | No
         count=len(size),
         rms_px=float(np.sqrt(np.mean(size**2))) if len(size) else float("nan"),
         median_px=float(np.median(size)) if len(size) else float("nan"),
-        image=_image_map(arrays["pixels"][finite], lens, residuals),
+        image=map_over_image(arrays["pixels"][finite], lens, residuals),
         over_angle=_curve(angle, size, angle_edges),
         over_time=_curve(seconds, size, time_edges),
     )
@@ -101,7 +101,7 @@ def summarise_tracks(arrays: Mapping[str, np.ndarray], lens: CameraModel | None)
         observations=len(frames),
         median_length=float(np.median(lengths)) if len(lengths) else 0.0,
         duration_s=float(seconds.max(initial=0.0)),
-        image=_image_map(arrays["pixels"], lens, None),
+        image=map_over_image(arrays["pixels"], lens, None),
         per_frame_at_s=seconds[thinned] if len(stamps) else seconds,
         per_frame=per_frame[thinned].astype(np.float64) if len(stamps) else seconds,
         report=json.loads(report) if report else {},
@@ -112,7 +112,9 @@ def _seconds(stamps_ns: np.ndarray) -> Array:
     return (stamps_ns - stamps_ns.min()) * 1e-9 if len(stamps_ns) else np.zeros(0)
 
 
-def _image_map(pixels: np.ndarray, lens: CameraModel | None, residuals: Array | None) -> ImageMap:
+def map_over_image(pixels: np.ndarray, lens: CameraModel | None, residuals: Array | None) -> ImageMap:
+    """Counts per cell of pixels (N, 2) and, if given, mean residuals (N, 2). lens: whose image size it is; None: as
+    large as the pixels reach."""
     if lens is not None:
         width_px, height_px = lens.width_px, lens.height_px
     else:

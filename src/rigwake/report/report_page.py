@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -19,11 +20,13 @@ from rigwake.calibration.yaml_file import plain
 from rigwake.report.charts import Series, arrow_scale, image_map, line_chart, top_view
 from rigwake.report.content import RIG_TRAJECTORY, ReportContent, load_report_content
 from rigwake.report.extrinsics import directions, number, overview, plus_minus, time_offset, two_digits
+from rigwake.report.html_page import CLOCKS_ARE_SET_NS
 from rigwake.report.motion_figures import MotionFigures, motion_of, paths_in_one_world
 from rigwake.report.picture_overlays import embed_pictures, mask_uri
 from rigwake.report.report_verdict import judge
 from rigwake.report.scene import path_scene, rig_scene
 from rigwake.report.seamless import load_seamless
+from rigwake.trajectory import Trajectory
 
 
 def build_report(source: ReportContent | Path | str) -> Path:
@@ -77,6 +80,8 @@ def _values(content: ReportContent) -> dict[str, Any]:
         "scenes": _json(scenes),
         "content": content,
         "calibration": calibration,
+        "recorded": _recorded(calibration.provenance, rig),
+        "lenses": {name: c.model for name, c in calibration.cameras.items() if c.model is not None},
         "colours": colours,
         "verdict": judge(calibration),
         "rows": overview(calibration),
@@ -96,6 +101,23 @@ def _values(content: ReportContent) -> dict[str, Any]:
             dict.fromkeys(key for c in calibration.cameras.values() for key in c.statistics)
         ),
     }
+
+
+def _recorded(provenance: Mapping[str, Any], rig: Trajectory | None) -> str:
+    """Which recording, when and how long, as far as it is known."""
+    inputs = provenance.get("inputs")
+    names = (
+        [str(i.get("path", "")) for i in inputs if isinstance(i, Mapping)]
+        if isinstance(inputs, list | tuple)
+        else []
+    )
+    words = [", ".join(Path(name).name for name in names if name)]
+    if rig is not None:
+        start = int(rig.timestamps_ns[0])
+        if start >= CLOCKS_ARE_SET_NS:
+            words.append(str(np.datetime64(start, "ns").astype("datetime64[s]")).replace("T", " ") + " UTC")
+        words.append(f"{rig.duration_s:.0f} s")
+    return ", ".join(word for word in words if word)
 
 
 def _asset(name: str) -> Markup:
@@ -171,6 +193,21 @@ def _charts(
             "time, s",
             "median, px",
             [Series(n, r.over_time.at, r.over_time.median, colours.get(n, 0)) for n, r in residuals.items()],
+        ),
+        "angle_counts": line_chart(
+            "Observations against the angle from the optical axis",
+            "angle from the axis, degrees",
+            "observations",
+            [
+                Series(n, r.over_angle.at, r.over_angle.counts, colours.get(n, 0))
+                for n, r in residuals.items()
+            ],
+        ),
+        "time_counts": line_chart(
+            "Observations over time",
+            "time, s",
+            "observations",
+            [Series(n, r.over_time.at, r.over_time.counts, colours.get(n, 0)) for n, r in residuals.items()],
         ),
         "tracks": line_chart(
             "Tracked points per frame",

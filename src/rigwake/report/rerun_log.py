@@ -14,6 +14,8 @@ from rigwake.geometry.se3 import SE3
 from rigwake.report.content import RIG_TRAJECTORY, ReportContent
 from rigwake.report.motion_figures import thin
 
+_SIGMAS_DRAWN = 20  # as the report's slider at first: true sizes would hardly be seen
+
 
 def log_to_rerun(content: ReportContent, rrd: Path | None, view: bool) -> None:
     """Write an `.rrd` file, show it in the viewer, or both.
@@ -55,6 +57,9 @@ def _log(rerun: Any, stream: Any, content: ReportContent) -> None:
     stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     _log_cameras(rerun, stream, content)
     _log_motion(rerun, stream, content)
+    _log_sigmas(rerun, stream, content)
+    _log_residuals(rerun, stream, content)
+    _log_pictures(rerun, stream, content)
     stream.flush()
 
 
@@ -91,3 +96,52 @@ def _log_motion(rerun: Any, stream: Any, content: ReportContent) -> None:
     for k in thin(len(rig), 3000).tolist():
         stream.set_time("time", timestamp=np.datetime64(int(rig.timestamps_ns[k]), "ns"))
         stream.log("world/rig", _transform(rerun, rig.world_from_body[k]))
+
+
+def _log_sigmas(rerun: Any, stream: Any, content: ReportContent) -> None:
+    """Per camera an ellipsoid of its position, as many sigmas large as the report's; only where every axis is known."""
+    for name, camera in content.calibration.cameras.items():
+        covariance = camera.covariance_rig_axes[3:, 3:]
+        if not camera.is_observable or not np.isfinite(covariance).all():
+            continue
+        variances, axes = np.linalg.eigh(covariance)
+        axes[:, 2] *= np.sign(np.linalg.det(axes))
+        w, x, y, z = SE3(axes, np.zeros(3)).quat_wxyz.tolist()
+        drawn = rerun.Ellipsoids3D(
+            half_sizes=[_SIGMAS_DRAWN * np.sqrt(np.maximum(variances, 0.0))],
+            centers=[camera.rig_from_cam.translation],
+            quaternions=[rerun.Quaternion(xyzw=[x, y, z, w])],
+            labels=[f"{name}, {_SIGMAS_DRAWN} sigma"],
+        )
+        stream.log(f"world/rig/sigma/{name}", drawn, static=True)
+
+
+def _log_residuals(rerun: Any, stream: Any, content: ReportContent) -> None:
+    """Median reprojection error over time, a curve per camera."""
+    rig = content.trajectories.get(RIG_TRAJECTORY)
+    if rig is None:
+        return
+    for name, residuals in content.residuals.items():
+        curve = residuals.over_time
+        for at_s, median in zip(curve.at.tolist(), curve.median.tolist(), strict=True):
+            if np.isfinite(median):
+                stamp = int(rig.timestamps_ns[0]) + round(at_s * 1e9)
+                stream.set_time("time", timestamp=np.datetime64(stamp, "ns"))
+                stream.log(f"residuals_px/{name}", rerun.Scalars(median))
+
+
+def _log_pictures(rerun: Any, stream: Any, content: ReportContent) -> None:
+    """The pictures of the report in the frustum of their camera; landmarks where they are and where they must be."""
+    for shown in content.pictures:
+        if not shown.file.is_file():
+            continue
+        stream.set_time("time", timestamp=np.datetime64(shown.timestamp_ns, "ns"))
+        place = f"world/rig/{shown.camera}/image"
+        stream.log(place, rerun.EncodedImage(path=shown.file))
+        for what, points, colour in (
+            ("predicted", [p.predicted_px for p in shown.points], [255, 212, 0]),
+            ("seen", [p.observed_px for p in shown.points], [86, 180, 233]),
+        ):
+            stream.log(
+                f"{place}/{what}", rerun.Points2D(np.reshape(points, (-1, 2)), colors=[colour], radii=[3.0])
+            )
