@@ -137,7 +137,9 @@ def test_every_preset_through_every_format_is_the_same_recording(tmp_path: Path,
 def test_a_chain_of_conversions_changes_no_calibration(tmp_path: Path) -> None:
     """The tracks are the same to the last bit in each format, and so is the calibration at the end of the chain."""
     path = write_room(tmp_path / "0.bag")
-    settings = load_config(assignments=["adjustment.cross_camera=false", "tracking.max_features=120", "jobs=1"])
+    settings = load_config(
+        assignments=["adjustment.cross_camera=false", "tracking.max_features=120", "jobs=1"]
+    )
     first = calibrate(path, tmp_path / "first", settings).calibration
     chain: list[tuple[RecordingFormat, str]] = [*reversed(TARGETS[1:]), TARGETS[0]]
     for number, (file_format, name) in enumerate(chain, start=1):

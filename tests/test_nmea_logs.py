@@ -262,3 +262,9 @@ def test_covariances_that_are_none_are_replaced_and_said(bad: np.ndarray) -> Non
     stream, findings = gnss_stream_of_fixes("gnss", np.arange(30) * 10**9, fixes(), spread)
     np.testing.assert_allclose(stream.covariances[4:6], np.tile(25 * np.eye(3), (2, 1, 1)))
     assert findings[0].message.startswith("2 of 30 covariances")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-8-sig"])
+def test_logs_that_a_shell_redirected(tmp_path: Path, encoding: str) -> None:
+    stream, _ = read(tmp_path / "a.nmea", "".join(log()).encode(encoding))
+    assert len(stream.timestamps_ns) == 20
