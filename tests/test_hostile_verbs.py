@@ -139,7 +139,7 @@ def damaged_runs(folder: Path, files: dict[str, Path], inputs: list[FuzzInput], 
 @pytest.mark.slow
 def test_every_verb_takes_damaged_inputs(tmp_path: Path, files: dict[str, Path]) -> None:
     inputs = [*RECORDINGS, *BAGS, *CALIBRATIONS, *TRAJECTORIES, *READ_BACK]
-    assert damaged_runs(tmp_path, files, inputs, seed=90, count=6) > 250
+    assert damaged_runs(tmp_path, files, inputs, seed=90, count=3) > 120
 
 
 def a_pipe(path: Path) -> Path:
