@@ -15,18 +15,23 @@ from rigwake.cameras.formats.camera_files import write_cameras
 from rigwake.cameras.formats.camera_info import camera_from_info, info_of_any_camera
 from rigwake.cameras.registry import camera_class, camera_from_dict, camera_from_params
 from rigwake.cli.main import build_app
+from rigwake.config import load_config
 from rigwake.errors import InputError, UsageError
 from rigwake.excerpt import excerpt, longest_stretch
 from rigwake.inspection.inspection_summary import inspection_to_dict
 from rigwake.inspection.readiness import judge
 from rigwake.inspection.recording_inspection import inspect_recording
+from rigwake.pipeline.calibration_run import calibrate
 from rigwake.readers.open import open_recording
 from rigwake.readers.topics import TopicMap
 from rigwake.recording import Frame, Recording, static_transform
 from rigwake.simulation.scenario import build_scenario, load_scenario, preset_names
 from rigwake.simulation.setup import build_recording, prepare
+from rigwake.tracking.front_ends import track_camera
+from rigwake.tracks import load_tracks
 from rigwake.writers.write import RecordingFormat, write_recording
 from test_writers import small_recording
+from textured_room import write_room
 
 TARGETS: list[tuple[RecordingFormat, str]] = [
     ("ros1", "rec.bag"),
@@ -126,6 +131,40 @@ def test_every_preset_through_every_format_is_the_same_recording(tmp_path: Path,
         path = tmp_path / str(number) / name
         write_recording(first, path, file_format=file_format, image_encoding="copy")
         assert_same(open_recording(path), first)
+
+
+@pytest.mark.slow
+def test_a_chain_of_conversions_changes_no_calibration(tmp_path: Path) -> None:
+    """The tracks are the same to the last bit in each format, and so is the calibration at the end of the chain."""
+    path = write_room(tmp_path / "0.bag")
+    settings = load_config(
+        assignments=["adjustment.cross_camera=false", "tracking.max_features=120", "jobs=1"]
+    )
+    first = calibrate(path, tmp_path / "first", settings).calibration
+    chain: list[tuple[RecordingFormat, str]] = [*reversed(TARGETS[1:]), TARGETS[0]]
+    for number, (file_format, name) in enumerate(chain, start=1):
+        target = tmp_path / str(number) / name
+        write_recording(open_recording(path), target, file_format=file_format, image_encoding="copy")
+        path = target
+        camera = open_recording(path).camera("front")
+        again = track_camera(camera, settings.tracking)
+        tracked = load_tracks(tmp_path / "first" / "tracks" / "front.npz")
+        if number == 1:
+            expected = track_camera(open_recording(tmp_path / "0.bag").camera("front"), settings.tracking)
+            assert len(expected.pixels) > len(tracked.pixels) / 2
+        assert np.array_equal(again.pixels, expected.pixels), file_format
+        assert np.array_equal(again.bearings_cam, expected.bearings_cam)
+        assert np.array_equal(again.timestamps_ns, expected.timestamps_ns)
+    last = calibrate(path, tmp_path / "last", settings).calibration
+    assert last.cameras.keys() == first.cameras.keys()
+    for name, camera in first.cameras.items():
+        found = last.cameras[name]
+        assert np.abs(camera.rig_from_cam.local(found.rig_from_cam)).max() < 1e-6
+        assert found.time_offset_s == pytest.approx(camera.time_offset_s, abs=1e-7)
+        np.testing.assert_allclose(found.covariance, camera.covariance, rtol=1e-3)
+        assert found.model is not None
+        assert camera.model is not None
+        np.testing.assert_allclose(found.model.params, camera.model.params, rtol=1e-6)
 
 
 def test_a_chain_of_conversions_changes_nothing(tmp_path: Path) -> None:

@@ -456,3 +456,45 @@ def test_lens_files_of_a_folder(tmp_path: Path, kind: str) -> None:
     model = open_recording(tmp_path).cameras[camera].model
     assert model is not None
     np.testing.assert_allclose(model.params, LENS.params)
+
+
+PLACES = {
+    "degrees": ("t,lat_deg,lon_deg,alt_m", lambda lat, lon: f"{lat:.9f},{lon:.9f},40"),
+    "longitude first": ("time,lon,lat,height", lambda lat, lon: f"{lon:.9f},{lat:.9f},40"),
+    "radians": (
+        "t,lat [rad],lon [rad],h [m]",
+        lambda lat, lon: f"{np.radians(lat):.12f},{np.radians(lon):.12f},40",
+    ),
+    "u-blox": (
+        "t,lat [1e-7 deg],lon [1e-7 deg],alt [mm]",
+        lambda lat, lon: f"{lat * 1e7:.0f},{lon * 1e7:.0f},40000",
+    ),
+    "u-blox without a word": ("t,lat,lon,alt_mm", lambda lat, lon: f"{lat * 1e7:.0f},{lon * 1e7:.0f},40000"),
+    "decimal commas": ("t;lat;lon;alt", lambda lat, lon: f"{lat:.9f};{lon:.9f};40".replace(".", ",")),
+    "feet": ("t,lat,lon,alt_ft", lambda lat, lon: f"{lat:.9f},{lon:.9f},131.2336"),
+}
+
+
+@pytest.mark.parametrize("form", PLACES)
+@pytest.mark.parametrize("time", ["seconds", "dates"])
+def test_tables_of_positions(tmp_path: Path, form: str, time: str) -> None:
+    header, cells = PLACES[form]
+    separator = ";" if ";" in header else ","
+    rows = [header]
+    for k in range(10):
+        at = str(1_700_000_000 + k) if time == "seconds" else f"2023-11-14 22:13:{20 + k}"
+        rows.append(f"{at}{separator}{cells(53.54 + 1e-6 * k, 9.98 + 1e-6 * k)}")
+    (tmp_path / "gnss.csv").write_text("\n".join(rows) + "\n")
+    gnss = open_recording(tmp_path).gnss["gnss"]
+    assert (np.diff(gnss.timestamps_ns) == 10**9).all()
+    assert gnss.timestamps_ns[0] == 1_700_000_000 * 10**9
+    np.testing.assert_allclose(gnss.position_enu[-1, :2], [0.5965, 1.0018], atol=2e-3)
+    assert gnss.origin_lla == pytest.approx((53.54, 9.98, 40.0), abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["imu", "imu0", "imu_port"])
+def test_a_table_in_a_folder_of_its_own(tmp_path: Path, name: str) -> None:
+    folder(tmp_path, [str(START_NS)])
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "data.csv").write_text(imu_rows())
+    assert list(open_recording(tmp_path).imus) == [name]

@@ -262,3 +262,19 @@ def test_covariances_that_are_none_are_replaced_and_said(bad: np.ndarray) -> Non
     stream, findings = gnss_stream_of_fixes("gnss", np.arange(30) * 10**9, fixes(), spread)
     np.testing.assert_allclose(stream.covariances[4:6], np.tile(25 * np.eye(3), (2, 1, 1)))
     assert findings[0].message.startswith("2 of 30 covariances")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-8-sig"])
+def test_logs_that_a_shell_redirected(tmp_path: Path, encoding: str) -> None:
+    stream, _ = read(tmp_path / "a.nmea", "".join(log()).encode(encoding))
+    assert len(stream.timestamps_ns) == 20
+
+
+@pytest.mark.parametrize("sentinel", [-9999.0, 99999.0, -1e6, float("inf")])
+def test_heights_that_stand_for_none(sentinel: float) -> None:
+    lla = fixes()
+    lla[:5, 2] = sentinel
+    stream, findings = gnss_stream_of_fixes("gnss", np.arange(30) * 10**9, lla, np.zeros((30, 3, 3)))
+    assert ((stream.covariances[:, 2, 2] == UNKNOWN_UP_VARIANCE) == (np.arange(30) < 5)).all()
+    assert np.abs(stream.position_enu[:, 2]).max() < 1.0
+    assert "5 fixes have no altitude" in findings[0].message

@@ -13,12 +13,17 @@ import pytest
 import zstandard
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 
+from rigwake.cameras.registry import camera_from_params
+from rigwake.config import load_config
 from rigwake.errors import InputError, RigwakeError, UsageError
 from rigwake.inspection.recording_inspection import inspect_recording
+from rigwake.odometry.bridged import frames_not_tracked
+from rigwake.pipeline.stream_selection import select
 from rigwake.readers.images import ImageSize, compressed_size, decode_compressed, decode_raw
 from rigwake.readers.open import open_recording
 from rigwake.readers.topics import TopicMap
-from rigwake.recording import Recording
+from rigwake.recording import Finding, Recording
+from rigwake.tracking.front_ends import track_camera
 from rigwake.writers.ros_encoding import MessageFactory
 from rigwake.writers.rosbag import _Topic, _write, write_rosbag1
 from rigwake.writers.write import write_recording
@@ -171,6 +176,25 @@ def test_missing_camera_info(tmp_path: Path) -> None:
     recording = stamped_bag(tmp_path, [START_NS + k * 10**8 for k in range(5)])
     assert recording.camera("cam").model is None
     assert has_finding(recording, "no camera_info")
+
+
+def test_unreadable_frames_are_counted(tmp_path: Path) -> None:
+    """Also where none of them is among the frames that are sampled."""
+    images = [jpeg(60 + k % 100) for k in range(300)]
+    for bad in (17, 101, 202, 203):
+        images[bad] = images[bad][: len(images[bad]) // 2]
+    recording = stamped_bag(tmp_path, [START_NS + k * 10**8 for k in range(300)], images)
+    findings = inspect_recording(recording).findings
+    assert any("4 of 300 encoded frames are cut off" in f.message for f in findings)
+    camera = replace(
+        recording.camera("cam"), model=camera_from_params("pinhole", [20.0] * 4 + [0.0] * 6, 48, 32)
+    )
+    tracks = track_camera(camera)
+    assert frames_not_tracked(tracks)[-1] == "4 unreadable frames bridged"
+    damaged = replace(
+        recording, cameras={"cam": camera}, findings=(Finding("error", "cam", "half is gone."),)
+    )
+    assert "cam: half is gone." in select(damaged, load_config()).notes
 
 
 def test_stamps_that_go_back_are_sorted_and_flagged(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from rigwake._types import Array
 from rigwake.errors import EstimationError, UsageError
 from rigwake.intrinsics.board_observations import MIN_CORNERS, BoardObservations, BoardView, gathered
 from rigwake.intrinsics.boards import Board
-from rigwake.readers.picture_files import IMAGE_SUFFIXES
+from rigwake.readers.picture_files import IMAGE_SUFFIXES, picture_or_none
 
 Grey = NDArray[np.uint8]
 Found = tuple[NDArray[np.int64], Array]  # corner ids and pixels
@@ -170,7 +170,7 @@ def detect_board(
     """
 
     def work(file: Path) -> tuple[tuple[int, int] | None, Found]:
-        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        image = picture_or_none(file)
         found = _NOTHING if image is None else detect_corners(board, image)
         progress()
         return (None if image is None else (image.shape[1], image.shape[0])), found

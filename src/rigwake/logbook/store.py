@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import sqlite3
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -68,7 +69,7 @@ class Logbook:
                 remedy=f"`rigwake log add {self.path} calibration.yaml` begins one.",
             )
         try:
-            uri = f"file:{quote(str(self.path.absolute()))}?mode={'ro' if read_only else 'rwc'}"
+            uri = f"file:{quote(os.fsencode(self.path.absolute()))}?mode={'ro' if read_only else 'rwc'}"
             self._db = sqlite3.connect(uri, uri=True, timeout=_BUSY_MS / 1000, isolation_level=None)
         except sqlite3.Error as error:
             raise _failure(self.path, error) from error

@@ -90,6 +90,11 @@ def used_by_one(out: Path) -> Iterator[None]:
         out.mkdir(parents=True, exist_ok=True)
         lock = _locked(out / _LOCK)
     except (OSError, ValueError) as error:
+        with contextlib.suppress(OSError, ValueError):
+            if (out / _LOCK).stat().st_size == 0:  # ours, which could not be filled
+                (out / _LOCK).unlink()
+            for folder in created:
+                folder.rmdir()
         raise UsageError(
             f"{out} cannot be written: {getattr(error, 'strerror', None) or error}.",
             consequence="Nothing was computed.",

@@ -6,13 +6,14 @@ late, or a batch of them, fills a gap and is no such step.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
-from rigwake._types import Array, Indices, Stamps
+from rigwake._types import Indices, Stamps
 from rigwake.excerpt import window
 from rigwake.recording import Finding, Recording
 
@@ -22,6 +23,7 @@ _GAP_PERIODS = 3.0
 _MOST_STEPS = 5  # a clock that is set more often is none: its samples are sorted
 _SAME_EVENT_NS = 2 * 10**9
 _STREAMS = ("cameras", "imus", "gnss", "attitudes", "poses")
+_Sensor = TypeVar("_Sensor")
 
 
 @dataclass(frozen=True)
@@ -94,17 +96,37 @@ def on_one_clock(recording: Recording) -> Recording:
     silent = [name for name, stamps in _stamps(recording) if _must_show(stamps, main)]
     if len([name for name in silent if name not in agreeing | opposed]) > shown:
         return recording
-    named = {key: getattr(recording, key) for key in _STREAMS}
-    others = {k: {n: s for n, s in v.items() if n not in agreeing | opposed} for k, v in named.items()}
     first, last = _certain_time(main)
-    part = window(replace(recording, **others), first, last)
-    whole = {k: {n: s for n, s in v.items() if n in agreeing} | getattr(part, k) for k, v in named.items()}
-    ordered = {k: {n: whole[k][n] for n in named[k] if n in whole[k]} for k in _STREAMS}
+    cut = agreeing | opposed
+    others = replace(
+        recording,
+        cameras={n: s for n, s in recording.cameras.items() if n not in cut},
+        imus={n: s for n, s in recording.imus.items() if n not in cut},
+        gnss={n: s for n, s in recording.gnss.items() if n not in cut},
+        attitudes={n: s for n, s in recording.attitudes.items() if n not in cut},
+        poses={n: s for n, s in recording.poses.items() if n not in cut},
+    )
+    part = window(others, first, last)
     words = (
         "left out: its clock was set back too, and its longest stretch is another than that of the others."
     )
     lost = tuple(Finding("error", name, words) for name in sorted(opposed))
-    return replace(part, **ordered, findings=(*part.findings, *lost))
+    return replace(
+        part,
+        cameras=_with(part.cameras, recording.cameras, agreeing),
+        imus=_with(part.imus, recording.imus, agreeing),
+        gnss=_with(part.gnss, recording.gnss, agreeing),
+        attitudes=_with(part.attitudes, recording.attitudes, agreeing),
+        poses=_with(part.poses, recording.poses, agreeing),
+        findings=(*part.findings, *lost),
+    )
+
+
+def _with(
+    kept: Mapping[str, _Sensor], all_of_them: Mapping[str, _Sensor], names: set[str]
+) -> dict[str, _Sensor]:
+    """Those kept and those of these names, in the order of all."""
+    return {n: kept.get(n, s) for n, s in all_of_them.items() if n in kept or n in names}
 
 
 def _same_event(one: ClockSetBack, other: ClockSetBack) -> bool:
@@ -126,7 +148,7 @@ def _stamps(recording: Recording) -> Iterator[tuple[str, Stamps]]:
             yield name, stream.timestamps_ns
 
 
-def _must_show(stamps: Array, step: ClockSetBack) -> bool:
+def _must_show(stamps: Stamps, step: ClockSetBack) -> bool:
     """Whether a sensor was recording on both sides of the first step, and fast enough to show it."""
     if len(stamps) < 2:
         return False

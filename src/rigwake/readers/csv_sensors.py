@@ -26,19 +26,17 @@ from rigwake.recording import AttitudeStream, Finding, GnssStream, ImuStream
 
 Findings = tuple[Finding, ...]
 _HEADERLESS_IMU = ("t", "first_x", "first_y", "first_z", "second_x", "second_y", "second_z")
-_LATITUDE_LONGITUDE = (
-    ("latitude", "longitude"),
-    ("lat", "lon"),
-    ("lat", "lng"),
-    ("lat", "long"),
+_UNITS_OF_PLACES = ("", "_deg", "_rad", "_e7")
+_LATITUDE_LONGITUDE = tuple(
+    (f"{latitude}{unit}", f"{longitude}{unit}")
+    for unit in _UNITS_OF_PLACES
+    for latitude, longitude in (("latitude", "longitude"), ("lat", "lon"), ("lat", "lng"), ("lat", "long"))
 )
-_LATITUDE_LONGITUDE += tuple(
-    (f"{latitude}_{unit}", f"{longitude}_{unit}")
-    for unit in ("deg", "rad", "e7")
-    for latitude, longitude in _LATITUDE_LONGITUDE
+_HEIGHT = tuple(
+    f"{name}{unit}"
+    for unit in ("", "_m", "_mm", "_cm", "_ft")
+    for name in ("altitude", "alt", "height", "ellipsoidal_height", "hgt", "elevation", "h")
 )
-_HEIGHT = ("altitude", "alt", "height", "ellipsoidal_height", "hgt", "elevation", "h")
-_HEIGHT += tuple(f"{name}_{unit}" for unit in ("m", "mm", "cm", "ft") for name in _HEIGHT)
 _RADIANS = ("rad", "radian", "radians")
 _TEN_MILLIONTHS = ("1e-7 deg", "1e-7deg", "1e-7", "deg*1e-7", "deg*1e7", "dege7", "dege-7", "e7", "1e7 deg")
 _ENU_COVARIANCE = ("cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu")

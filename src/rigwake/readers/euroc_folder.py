@@ -101,7 +101,7 @@ def _kalibr_chain(path: Path, found: _EurocStreams) -> dict[str, Mapping[str, An
 
 def _add_camera(folder: Path, kalibr: Mapping[str, Any] | None, found: _EurocStreams) -> None:
     name = folder.name
-    table = read_table(folder / "data.csv")
+    table = read_table(folder / "data.csv", names=("timestamp", "filename"))
     stamps = table.stamps_ns()
     file_column = table.find("filename", "file", "image", *[c for c in table.columns if c != "timestamp"])
     if file_column is None:

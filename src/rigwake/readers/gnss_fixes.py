@@ -17,6 +17,7 @@ UNKNOWN_UP_VARIANCE = 1e6
 _FAR_M = 5e5
 _METRES_PER_DEG = 111e3
 _HIGHEST_M = 1e5
+_FAR_UP_M = 2e3  # from the usual height
 
 
 def gnss_stream_of_fixes(
@@ -39,7 +40,9 @@ def gnss_stream_of_fixes(
     findings: list[Finding] = []
     with np.errstate(invalid="ignore"):
         possible = (np.abs(lla[:, 0]) <= 90) & (np.abs(lla[:, 1]) <= 360)
-        high = np.abs(lla[:, 2]) < _HIGHEST_M
+        high = (np.abs(lla[:, 2]) < _HIGHEST_M) & possible
+        if high.any():  # -9999 and the like stand for a height that is missing
+            high &= np.abs(lla[:, 2] - np.median(lla[high, 2])) < _FAR_UP_M
     lla[~possible] = np.nan
     beyond = np.abs(lla[:, 1]) > 180  # false for NaN
     lla[beyond, 1] = (lla[beyond, 1] + 180.0) % 360.0 - 180.0

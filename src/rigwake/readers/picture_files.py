@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from rigwake._types import Image
 from rigwake.errors import InputError
 from rigwake.readers.images import ImageSize, checked_size, compressed_size, decode_compressed
 from rigwake.readers.pixel_encodings import depth_of_sensor
+from rigwake.text_files import require_file
 
 IMAGE_SUFFIXES = frozenset(
     {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".webp"}
@@ -23,6 +25,7 @@ _PNM = re.compile(
 )
 _ORIENTATION, _WIDTH, _HEIGHT = 0x0112, 0x0100, 0x0101
 _SWAPPED = (5, 6, 7, 8)
+_LARGEST_BYTES = 2**30
 
 
 def picture_size(encoded: bytes) -> ImageSize:
@@ -42,6 +45,20 @@ def picture_size(encoded: bytes) -> ImageSize:
     except (struct.error, IndexError) as error:
         raise InputError("An image is cut off within its header.") from error
     return compressed_size(encoded)
+
+
+def picture_or_none(path: Path, flags: int = cv2.IMREAD_GRAYSCALE) -> Image | None:
+    """What `cv2.imread` gives for a regular file, None for anything else. OpenCV never sees the path: where the locale
+    has no words for its characters it ends the process."""
+    try:
+        require_file(path)
+        if path.stat().st_size > _LARGEST_BYTES:
+            return None
+        encoded = path.read_bytes()
+        picture_size(encoded)
+        return _decoded(encoded, flags)
+    except (InputError, OSError):
+        return None
 
 
 def orientation_of(encoded: bytes) -> int:

@@ -17,6 +17,7 @@ import numpy as np
 from rigwake.calibration import Calibration, load_calibration
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import InputError, RigwakeError
+from rigwake.readers.picture_files import picture_or_none
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.report.reduce import ResidualSummary, TrackSummary, summarise_residuals, summarise_tracks
 from rigwake.trajectory import Trajectory
@@ -165,7 +166,7 @@ def _read_masks(folder: Path) -> dict[str, np.ndarray]:
 
 
 def _image(file: Path) -> np.ndarray:
-    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    image = picture_or_none(file)
     if image is None:
         raise InputError(f"{file.name} is not an image.")
     return image

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from rigwake.readers.picture_files import picture_or_none
 from rigwake.report.content import OverlayPoint, Picture
 
 BUDGET_BYTES = 8_000_000
@@ -41,7 +42,7 @@ def embed_pictures(pictures: Sequence[Picture]) -> tuple[list[EmbeddedPicture], 
     embedded, unreadable = [], []
     fraction = BUDGET_BYTES * 3 // 4 // max(len(pictures), 1)  # base64 makes four bytes of three
     for picture in pictures:
-        image = cv2.imread(str(picture.file), cv2.IMREAD_COLOR) if picture.file.is_file() else None
+        image = picture_or_none(picture.file, cv2.IMREAD_COLOR)
         if image is None:
             unreadable.append(picture.file.name)
             continue

@@ -11,6 +11,8 @@ from typing import Any
 
 import cv2
 
+from rigwake.readers.picture_files import picture_or_none
+
 _FOLDER = "surround"
 _LARGEST_BYTES = 2**24
 _WIDTH_PX = 1100
@@ -86,7 +88,7 @@ def _json(path: Path) -> Mapping[str, Any]:
 
 
 def _uri(path: Path) -> str | None:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
+    image = picture_or_none(path, cv2.IMREAD_COLOR)
     if image is None:
         return None
     if image.shape[1] > _WIDTH_PX:

@@ -13,6 +13,7 @@ from rigwake._types import Array, Mask
 from rigwake.atomic import atomic_path
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import InputError, UsageError
+from rigwake.readers.picture_files import picture_or_none
 from rigwake.recording import CameraStream
 
 _DARK = 12  # grey levels: what a lens leaves outside its image circle, with stray light and noise
@@ -63,7 +64,7 @@ class CameraMask:
 
 def mask_from_file(path: Path, width_px: int, height_px: int) -> CameraMask:
     """A mask drawn by hand: black pixels are excluded. Raises InputError, UsageError if the size is another."""
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    image = picture_or_none(path)
     if image is None:
         raise InputError(
             f"{path} is not an image.",

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +14,7 @@ from rigwake._types import Mask
 from rigwake.calibration import Calibration
 from rigwake.errors import EstimationError, InputError, RigwakeError, UsageError
 from rigwake.readers.open import open_recording
+from rigwake.readers.picture_files import picture_or_none
 from rigwake.readers.topics import TopicMap
 from rigwake.recording import CameraStream, Recording
 from rigwake.tracking.masks import beyond_image_circle
@@ -211,7 +211,7 @@ def own_masks(
         mask = beyond_image_circle(stream)
         if hull == "mask":
             file = folder / "masks" / f"{name}_hull.png"
-            stored = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) if file.is_file() else None
+            stored = picture_or_none(file)
             if stored is not None and stored.shape == mask.shape:
                 mask = mask | (stored > 127)
             else:

@@ -20,6 +20,7 @@ from rigwake.readers.rig_file import read_rig_file
 from rigwake.readers.truth_files import read_true_rig
 from rigwake.recording import Recording
 from rigwake.rig import Rig, RigCamera
+from rigwake.text_files import read_text_file
 from rigwake.yaml_input import read_yaml_settings
 
 _MAX_BYTES = 2**20
@@ -121,7 +122,8 @@ def _opencv_file(path: Path) -> tuple[CameraModel, Array, Array]:
     if not path.is_file() or path.stat().st_size > _MAX_BYTES:
         raise InputError(f"{path} is not there, or too large for a calibration.")
     try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        text = read_text_file(path)
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         entries = {key: storage.getNode(key).mat() for key in (*_NEEDED, "scale_xy", "shift_xy")}
         storage.release()
     except (cv2.error, SystemError) as error:

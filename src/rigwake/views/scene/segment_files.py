@@ -16,7 +16,7 @@ from rigwake.atomic import atomic_path
 from rigwake.errors import InputError, UsageError
 from rigwake.readers.image_files import image_files
 from rigwake.readers.open import open_recording
-from rigwake.readers.picture_files import IMAGE_SUFFIXES
+from rigwake.readers.picture_files import IMAGE_SUFFIXES, picture_or_none
 from rigwake.readers.topics import TopicMap
 from rigwake.views.frames import frame_sets
 from rigwake.views.prepare import SurroundOptions, prepare_surround
@@ -193,7 +193,7 @@ def _truth(folder: Path, picture: SegmentedPicture) -> ClassMap | None:
     path = folder / f"{picture.name}.png"
     if not path.is_file():
         return None
-    truth = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    truth = picture_or_none(path)
     if (
         truth is None
         or truth.shape != picture.labels.classes.shape
@@ -237,7 +237,7 @@ def _plain(
 
 
 def _read(path: Path) -> Image:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    image = picture_or_none(path, cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(f"{path} cannot be read as a picture.", remedy="Take it out of the folder.")
     return np.asarray(image, np.uint8)
