@@ -153,9 +153,13 @@ def middle(stamps: NDArray[np.int64]) -> int:
     return int((stamps[0] + stamps[-1]) // 2)
 
 
-def imu(change: Callable[[Table], None]) -> Callable[[Faulty], None]:
+def imu(change: Callable[[Table], object]) -> Callable[[Faulty], None]:
     """change: of values (N, 6) `[gyro, accel]`, in place."""
-    return lambda f: f.edit("imu.csv", lambda stamps, v: change(v))
+
+    def in_place(stamps: NDArray[np.int64], v: Table) -> None:
+        change(v)
+
+    return lambda f: f.edit("imu.csv", in_place)
 
 
 def gnss(change: Callable[[Table], None]) -> Callable[[Faulty], None]:
