@@ -406,7 +406,8 @@ def judged(recording: Path, truth: Path, named: list[str], cache: Path) -> str:
             verdict = "refused" if good else "refused, not named"
             return f"{verdict} | {'yes' if good else 'NO'} | – | – | {'sound' if good else 'WRONG'} | {words[:110]}"
         noted = [c for c in run.sensor_checks if c.hypothesis]
-        words = " ".join(c.sentence for c in noted).lower() + " ".join(run.failed).lower()
+        words = " ".join([*(c.sentence for c in noted), *run.failed, *run.notes]).lower()
+        words = words.replace("accelerations in", "accelerometer in")
         good = all(name in words for name in named)
         errors = evaluate_calibration(
             run.calibration, rig_in_frame(read_true_rig(truth), run.calibration.reference)

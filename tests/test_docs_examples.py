@@ -247,7 +247,9 @@ def test_every_page_is_in_the_site_and_linked_from_its_start() -> None:
     docs = ROOT / "docs"
     pages = {page.relative_to(docs).as_posix() for page in docs.rglob("*.md")}
     named = set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text()))
-    assert pages == named | {page for page in pages if page.startswith("cli/")}  # its index links to a page per verb
+    assert pages == named | {
+        page for page in pages if page.startswith("cli/")
+    }  # its index links to a page per verb
     linked = set(re.findall(r"\]\(([\w/]+\.md)\)", (docs / "index.md").read_text()))
     assert {page for page in pages if "/" not in page} - linked == {"index.md"}
     assert {"reference/api.md", "measurements/index.md"} <= linked  # the ways to pages made by programs

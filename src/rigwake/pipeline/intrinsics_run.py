@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from rigwake._progress import Progress
 from rigwake._types import Image
 from rigwake.errors import HostError, RigwakeError
 from rigwake.intrinsics.board_calibration import IntrinsicCalibration, calibrate
@@ -20,7 +21,6 @@ from rigwake.intrinsics.result_file import calibration_to_dict
 from rigwake.intrinsics.select import ModelScore, choose, cross_validate
 from rigwake.recording import CameraStream
 from rigwake.report.intrinsics_page import CalibratedLens, intrinsics_page
-from rigwake.workers import StageProgress
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def lenses_of_recording(
     streams: Sequence[CameraStream],
     board: Board,
     choice: LensChoice,
-    progress: StageProgress = lambda name, what, fraction: None,
+    progress: Progress = lambda name, what, fraction: None,
 ) -> IntrinsicsRun:
     """The lens of each camera by itself; one that fails does not stop the others. Raises HostError."""
     found: dict[str, BoardLens] = {}
@@ -108,9 +108,7 @@ def lenses_of_recording(
     return IntrinsicsRun(found, failed)
 
 
-def _lens_of_stream(
-    stream: CameraStream, board: Board, choice: LensChoice, progress: StageProgress
-) -> BoardLens:
+def _lens_of_stream(stream: CameraStream, board: Board, choice: LensChoice, progress: Progress) -> BoardLens:
     def searched(done: int, total: int) -> None:
         progress(stream.name, "looking for the board", done / max(total, 1))
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rigwake.ba.rig.initialisation import InitialRig
+from rigwake.ba.rig.rig_values import InitialRig
 from rigwake.config import CalibrateConfig
 from rigwake.pipeline.before_start import without_cameras
 from rigwake.pipeline.lens_mending import MendedLenses, mend_lenses, refuse_contradicted, started_from

@@ -147,7 +147,8 @@ def accel_in_si(accel: Array, unit: str, name: str) -> tuple[Array, list[Finding
         message = f"the header says {unit}, but accelerations of {size:.3g} are {chosen}: taken so."
         return converted, [Finding("warning", name, message)]
     said = "the header says so" if stated else f"their size, {size:.3g}, is that of gravity"
-    return converted, [Finding("note", name, f"accelerations in {chosen} ({said}): converted to m/s^2.")]
+    severity = "note" if stated else "warning"
+    return converted, [Finding(severity, name, f"accelerations in {chosen} ({said}): converted to m/s^2.")]
 
 
 def headerless_columns(numbers: Array) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
