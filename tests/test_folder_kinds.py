@@ -498,3 +498,14 @@ def test_a_table_in_a_folder_of_its_own(tmp_path: Path, name: str) -> None:
     (tmp_path / name).mkdir()
     (tmp_path / name / "data.csv").write_text(imu_rows())
     assert list(open_recording(tmp_path).imus) == [name]
+
+
+@pytest.mark.parametrize("name", ["front.mp4", "front.AVI", "front.mkv"])
+def test_a_video_alone(tmp_path: Path, name: str) -> None:
+    path = video(tmp_path / name, 6)
+    recording = open_recording(path)
+    assert list(recording.cameras) == ["front"]
+    assert len(list(recording.camera("front").frames())) == 6
+    path.write_bytes(b"no video")
+    with pytest.raises(InputError, match="cannot be read"):
+        open_recording(path)

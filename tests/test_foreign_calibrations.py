@@ -248,3 +248,9 @@ def test_all_pairs_of_formats_agree(tmp_path: Path) -> None:
     for a, b in itertools.combinations(read, 2):
         for x, y in zip(a.cameras.values(), b.cameras.values(), strict=True):
             np.testing.assert_allclose(x.rig_from_cam.matrix, y.rig_from_cam.matrix, atol=1e-6)
+
+
+def test_the_folder_that_calibrate_leaves(tmp_path: Path) -> None:
+    calibration = small_calibration()
+    save_calibration(calibration, tmp_path / "calibration.yaml")
+    assert read_calibration(tmp_path).cameras.keys() == calibration.cameras.keys()

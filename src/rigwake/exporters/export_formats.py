@@ -99,6 +99,8 @@ def export_calibration(
 def read_calibration(path: Path | str) -> Calibration:
     """A calibration in any known format, recognised by its content; InputError says what was expected."""
     path = Path(path)
+    if (path / "calibration.yaml").is_file():  # the folder that `rigwake calibrate` leaves
+        path = path / "calibration.yaml"
     name = _recognise(path)
     if name in _READ_ONLY:
         return _READ_ONLY[name](path)

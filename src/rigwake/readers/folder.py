@@ -97,6 +97,14 @@ def read_folder(path: Path) -> Recording:
     )
 
 
+def read_video(path: Path) -> Recording:
+    """A video alone, with the lens of a camera file beside it. Raises InputError if it cannot be read."""
+    found = _FolderStreams(path.parent)
+    _find_lenses(found)
+    _add_video(path, found)
+    return Recording(path, "video", found.cameras, findings=tuple(found.findings))
+
+
 def _find_lenses(found: _FolderStreams) -> None:
     """Lenses, and the rig where it is known, of `rig.yaml` or of any camera file of the usual names."""
     path = next((found.root / name for name in _LENS_FILES if (found.root / name).is_file()), None)

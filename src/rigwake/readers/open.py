@@ -11,7 +11,7 @@ from rigwake.excerpt import longest_stretch
 from rigwake.readers.channels import BagIndex
 from rigwake.readers.clock_steps import on_one_clock
 from rigwake.readers.euroc_folder import euroc_root, read_euroc
-from rigwake.readers.folder import is_plain_folder, read_folder
+from rigwake.readers.folder import is_plain_folder, read_folder, read_video
 from rigwake.readers.kitti import is_kitti_odometry, is_kitti_raw, read_kitti_odometry, read_kitti_raw
 from rigwake.readers.lens_choice import with_chosen_lenses
 from rigwake.readers.mcap_file import MAGIC as MCAP_MAGIC
@@ -30,6 +30,7 @@ from rigwake.readers.rosbag2 import (
     is_rosbag2_folder,
 )
 from rigwake.readers.topics import TopicMap
+from rigwake.readers.video_files import VIDEO_SUFFIXES
 from rigwake.recording import Finding, Recording
 from rigwake.text_files import require_file
 
@@ -84,6 +85,8 @@ def _read(path: Path, topics: TopicMap) -> Recording:
                     return read(path)
             if is_rosbag2_folder(path):  # its recorder was killed before it wrote metadata.yaml
                 return recording_from_bag(path, index_rosbag2_folder(path), topics)
+        elif path.suffix.lower() in VIDEO_SUFFIXES:
+            return read_video(path)
         else:
             with path.open("rb") as file:
                 if looks_like_nmea(file.read(_START_BYTES)):
@@ -95,7 +98,7 @@ def _read(path: Path, topics: TopicMap) -> Recording:
 
 _KNOWN = (
     "Known are ROS 1 bags, ROS 2 bags (sqlite3, MCAP), EuRoC/ASL and KITTI folders, folders of images or "
-    "videos with csv files, and NMEA logs."
+    "videos with csv files, single videos, and NMEA logs."
 )
 
 
