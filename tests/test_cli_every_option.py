@@ -124,7 +124,7 @@ USED = [
     ("diff {calibration} {calibration} --range 10 --range 50 --json {here}/d.json", 0, "at 50 m"),
     ("diff {calibration} {open}", 0, "next:"),
     ("diff {calibration} {open} --html {here}/diff.html", 0, "next:"),
-    ("handeye {rig_tum} {port_tum} --html {here}/handeye.html", 0, "next:"),
+    ("handeye {rig_tum} {port_tum} -o {here}/h12.yaml --html {here}/handeye.html", 0, "mountings determined"),
     ("intrinsics {corners} --image-size 640x480 --model kb4 --html {here}/lens.html", 0, "written:"),
     (
         "intrinsics {images} --camera all --board chessboard:9x6:0.03 --topic camera.front=/a --topics {topics}",

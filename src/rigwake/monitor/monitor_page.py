@@ -104,7 +104,9 @@ def _conditions(result: MonitorResult) -> str:
     )
     heads = "".join(f"<th>{escape(name)}, pairs</th>" for name in scores.cameras)
     return (
-        '<section class="card"><h2>What there was to see</h2><div class="scroll"><table><tr><th>s</th><th>speed, m/s'
+        '<section class="card"><h2>What there was to see</h2>'
+        '<div class="scroll" tabindex="0" role="region" aria-label="What there was to see">'
+        "<table><tr><th>s</th><th>speed, m/s"
         f"</th><th>turn rate, deg/s</th>{heads}</tr>{rows}</table></div></section>"
     )
 
