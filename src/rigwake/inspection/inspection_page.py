@@ -14,6 +14,7 @@ from rigwake._types import Array
 from rigwake.inspection.readiness import Readiness
 from rigwake.inspection.recording_inspection import Inspection, sensors
 from rigwake.inspection.timing import periods_s
+from rigwake.inspection.told_over_time import ToldOverTime
 from rigwake.recording import main_gnss
 
 _MAX_POINTS = 4000  # of one curve
@@ -25,10 +26,11 @@ text-align: left } .verdict { font-size: 1.3em; font-weight: 600 }
 """
 
 
-def inspection_page(inspection: Inspection, verdict: Readiness) -> str:
+def inspection_page(inspection: Inspection, verdict: Readiness, told: ToldOverTime | None = None) -> str:
     """The page; it loads nothing from elsewhere."""
     recording = inspection.recording
-    figures = [figure for figure in (_timeline(inspection), _motion(inspection), _path(inspection)) if figure]
+    candidates = (_timeline(inspection), _motion(inspection), _told(inspection, told), _path(inspection))
+    figures = [figure for figure in candidates if figure]
     plots = [
         figure.to_html(full_html=False, include_plotlyjs="inline" if at == 0 else False)
         for at, figure in enumerate(figures)
@@ -117,6 +119,21 @@ def _motion(inspection: Inspection) -> go.Figure | None:
         times, speed = _thinned((path.times_ns - start) * 1e-9, path.speed)
         figure.add_scatter(x=times, y=speed, name="speed (m/s)", row=3, col=1)
     figure.update_layout(title="Motion", height=600)
+    return figure
+
+
+def _told(inspection: Inspection, told: ToldOverTime | None) -> go.Figure | None:
+    """Bars of what each stretch tells about the rig; those that would be used in another colour."""
+    if told is None:
+        return None
+    figure = go.Figure()
+    middle = (told.starts_ns - _start_ns(inspection)) * 1e-9 + told.lengths_s / 2
+    for rows, name in ((told.chosen, "used"), (~told.chosen, "not used")):
+        if rows.any():
+            figure.add_bar(x=middle[rows], y=100 * told.told[rows], width=told.lengths_s[rows], name=name)
+    figure.update_layout(title=f"Information about the rig: {escape(told.words)}", height=360)
+    figure.update_xaxes(title="s")
+    figure.update_yaxes(title="% of all")
     return figure
 
 

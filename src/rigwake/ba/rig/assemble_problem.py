@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from rigwake._types import Array, Indices
 from rigwake.ba.rig.gnss_noise import with_receiver_errors
 from rigwake.ba.rig.rig_values import AdjustmentOptions, AssembledProblem, InitialValues, RigMeasurements
+from rigwake.ba.solver.preintegration import LONGEST_BRIDGE_S
 from rigwake.ba.solver.rig_problem import (
     Antenna,
     BundleCamera,
@@ -20,6 +21,7 @@ from rigwake.ba.solver.rig_problem import (
 )
 from rigwake.errors import EstimationError
 from rigwake.geometry.interpolate import TransformSpline, interpolate
+from rigwake.geometry.se3 import SE3
 from rigwake.geometry.triangulation import triangulate_rays
 from rigwake.tracks import Tracks
 
@@ -99,10 +101,20 @@ def _states(measurements: RigMeasurements, start: InitialValues, options: Adjust
     if measurements.imu is None:
         return States(stamps, world_from_rig)
     # differentiating the thinned positions averages the noise of a dense trajectory
-    velocity = TransformSpline(stamps, world_from_rig).velocity_world(stamps)
+    velocity = _velocity(stamps, world_from_rig)
     n = len(stamps)
     inertial = InertialStates(velocity, np.tile(start.gyro_bias, (n, 1)), np.tile(start.accel_bias, (n, 1)))
     return States(stamps, world_from_rig, inertial)
+
+
+def _velocity(stamps: Indices, world_from_rig: SE3) -> Array:
+    """(N, 3) velocities in the world, section by section: nobody knows how the rig went from one to the next."""
+    velocity = np.zeros((len(stamps), 3))
+    breaks = np.flatnonzero(np.diff(stamps) > round(LONGEST_BRIDGE_S * 1e9)) + 1
+    for rows in np.split(np.arange(len(stamps)), breaks):
+        if len(rows) > 1:
+            velocity[rows] = TransformSpline(stamps[rows], world_from_rig[rows]).velocity_world(stamps[rows])
+    return velocity
 
 
 def _observe(
@@ -118,7 +130,10 @@ def _observe(
     nearest = np.where(at - frame_stamps[before] < frame_stamps[after] - at, before, after)
     gap_ns = np.abs(frame_stamps[nearest] - at)
     usual_ns = np.median(np.diff(at)) if len(at) > 1 else 1e9
-    frames = np.unique(nearest[gap_ns <= 0.6 * usual_ns])
+    near = gap_ns <= 0.6 * usual_ns
+    if states.inertial is None:
+        near &= ~_in_a_break(frame_stamps[nearest], at)
+    frames = np.unique(nearest[near])
     kept = np.isin(tracks.frame_indices, frames)
     counts = np.bincount(tracks.track_ids[kept], minlength=int(tracks.track_ids.max(initial=0)) + 1)
     kept &= counts[tracks.track_ids] >= options.min_observations
@@ -132,6 +147,13 @@ def _observe(
         tracks.std_px[rows],
     )
     return observations, chosen
+
+
+def _in_a_break(stamps: Indices, states: Indices) -> NDArray[np.bool_]:
+    """Which stamps lie between two states that are so far apart that nothing can be said of the way between."""
+    right = np.clip(np.searchsorted(states, stamps), 1, len(states) - 1)
+    inside = (stamps > states[right - 1]) & (stamps < states[right])
+    return np.asarray(inside & (states[right] - states[right - 1] > round(LONGEST_BRIDGE_S * 1e9)))
 
 
 def _longest_everywhere(tracks: Tracks, camera: BundleCamera, options: AdjustmentOptions) -> Indices:
