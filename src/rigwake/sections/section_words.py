@@ -47,7 +47,7 @@ def clock_words(spans_ns: tuple[tuple[int, int], ...], start_ns: int) -> str:
 
 def duration_words(seconds: float) -> str:
     """`40 s`, `3 min`, `2.5 h`."""
-    if seconds < 90:
+    if seconds < 180:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
