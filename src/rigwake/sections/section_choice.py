@@ -17,7 +17,8 @@ from rigwake._types import Array, Indices
 from rigwake.sections.stretch_information import StretchInformation
 
 _FEWEST_TOGETHER = 3  # stretches of the first piece: initial values come from an unbroken one
-_LIMITS = (np.deg2rad(5.0), 1.0)  # rad, m: less sure than this is unobservable
+_WORTH_KNOWING = (np.deg2rad(1.0), 0.2)  # rad, m: what all of it tells no better than this decides nothing
+_UNOBSERVABLE = (np.deg2rad(5.0), 1.0)  # rad, m: the limits of the result
 _WORTH = 0.05  # of sigma: what all that is left must gain to be worth it
 _TINY = 1e-9
 
@@ -32,8 +33,8 @@ class Precision:
 
 @dataclass(frozen=True)
 class CameraSigmas:
-    """Predicted sigmas of one camera along its worst axis, among those that the recording tells at all; rad and m.
-    undetermined: how many of its six axes it does not tell."""
+    """Predicted sigmas of one camera along its worst axis, among those that the recording tells to a degree and 20 cm;
+    rad and m. undetermined: how many of its six axes it tells no better."""
 
     rotation: float
     translation: float
@@ -57,55 +58,64 @@ class SectionChoice:
         return sum(end - begin for begin, end in self.sections_ns) * 1e-9
 
 
-class _Whitened:
-    """Information in units of what the whole recording tells, without the directions that it does not tell."""
+class WhitenedInformation:
+    """Information in units of what the whole recording tells.
 
-    def __init__(self, information: StretchInformation) -> None:
-        self.parameters, self.cameras = information.parameters, information.cameras
+    Of each camera's turn and place the axes count that the whole recording tells to `limits` (rad, m): along the
+    others no choice makes a difference worth its time.
+    """
+
+    def __init__(
+        self, information: StretchInformation, limits: tuple[float, float] = _WORTH_KNOWING
+    ) -> None:
         total = information.of(np.arange(len(information)))
         scale = np.sqrt(np.maximum(np.diag(total), _TINY))
-        fractions, vectors = np.linalg.eigh(total / np.outer(scale, scale))
-        spread = vectors / scale[:, None] / np.sqrt(np.maximum(fractions, _TINY**2))
-        limits = np.full(len(total), np.inf)
-        for key, columns in self.parameters.items():
-            if key[1] == "rig_from_cam":
-                limits[columns] = np.repeat(_LIMITS, 3)
-        # a direction is told if no camera moves along it by more than the limits, at one sigma
-        told = (fractions > _TINY) & (np.abs(spread) <= limits[:, None]).all(axis=0)
-        self.basis = spread[:, told]
-        self.untold = spread[:, ~told] / np.maximum(np.linalg.norm(spread[:, ~told], axis=0), _TINY)
-        self.prior = self._of(information.prior)
-        self.matrices = np.einsum(
-            "ka,skl,lb->sab", self.basis, information.matrices, self.basis, optimize=True
-        )
-
-    def _of(self, matrix: Array) -> Array:
-        return np.asarray(self.basis.T @ matrix @ self.basis)
+        # what nothing tells is given next to nothing, so that all can be inverted
+        scaled = total / np.outer(scale, scale) + _TINY * np.eye(len(total))
+        values, vectors = np.linalg.eigh(scaled)
+        self.basis = vectors / scale[:, None] / np.sqrt(np.maximum(values, _TINY))
+        weak = _TINY * np.diag(scale**2)
+        self.prior = np.asarray(self.basis.T @ (information.prior + weak) @ self.basis)
+        self.matrices = np.einsum("ka,skl,lb->sab", self.basis, information.matrices, self.basis, optimize=True)
+        self.parts: dict[str, tuple[tuple[slice, Array], ...]] = {}
+        for name in information.cameras:
+            first = information.parameters[name, "rig_from_cam"].start
+            turn, place = slice(first, first + 3), slice(first + 3, first + 6)
+            self.parts[name] = tuple(
+                (part, _axes_within(self.basis[part], limit))
+                for part, limit in zip((turn, place), limits, strict=True)
+            )
 
     def information(self, chosen: list[int]) -> Array:
+        """(k, k) whitened information of these stretches."""
         return np.asarray(self.prior + self.matrices[chosen].sum(axis=0))
 
     def sigmas(self, chosen: list[int]) -> dict[str, CameraSigmas]:
         """Predicted sigmas of every camera with these stretches."""
-        matrix = self.information(chosen)
-        values, vectors = np.linalg.eigh(matrix)
+        values, vectors = np.linalg.eigh(self.information(chosen))
         half = self.basis @ (vectors / np.sqrt(np.maximum(values, _TINY)))
         found = {}
-        for name in self.cameras:
-            columns = self.parameters[name, "rig_from_cam"]
-            worst, missing = [], 0
-            for part in (slice(columns.start, columns.start + 3), slice(columns.start + 3, columns.stop)):
-                untold = self.untold[part]
-                directions, sizes, _ = (
-                    np.linalg.svd(untold) if untold.size else (np.eye(3), np.zeros(0), None)
-                )
-                kept = directions[:, int((sizes > 1e-3).sum()) :]
-                missing += 3 - kept.shape[1]
-                along = np.linalg.norm(half[part].T @ kept, axis=0) if kept.size else np.zeros(0)
-                spread = np.linalg.eigvalsh(kept.T @ half[part] @ half[part].T @ kept) if kept.size else along
-                worst.append(float(np.sqrt(max(spread.max(initial=0.0), 0.0))))
-            found[name] = CameraSigmas(worst[0], worst[1], missing)
+        for name, parts in self.parts.items():
+            turn, place = (_largest_std(axes.T @ half[part]) for part, axes in parts)
+            found[name] = CameraSigmas(turn, place, 6 - sum(axes.shape[1] for _, axes in parts))
         return found
+
+
+def _axes_within(half: Array, limit: float) -> Array:
+    """(3, n) principal axes of a covariance `half @ half.T` (3, 3) along which its sigma is within the limit."""
+    variances, axes = np.linalg.eigh(half @ half.T)
+    return np.asarray(axes[:, variances <= limit**2])
+
+
+def _largest_std(half: Array) -> float:
+    """Largest sigma of a covariance `half @ half.T`; 0 for none."""
+    return float(np.linalg.norm(half, 2)) if half.size else 0.0
+
+
+def tells_no_place(information: StretchInformation) -> bool:
+    """Whether even all of it leaves the place of every camera unobservable, along any axis."""
+    sigmas = WhitenedInformation(information, _UNOBSERVABLE).sigmas(list(range(len(information))))
+    return bool(sigmas) and all(s.undetermined >= 3 for s in sigmas.values())
 
 
 def choose_sections(
@@ -123,7 +133,7 @@ def choose_sections(
     without, stretches are taken until all that is left would gain less than 5 %. in_one_piece: they must touch (where
     nothing tells how the rig moved from one to the next). use_all: why all of it is to be used, and only predicted.
     """
-    whitened = _Whitened(information)
+    whitened = WhitenedInformation(information)
     everything = list(range(len(information)))
     whole = whitened.sigmas(everything)
     if use_all or len(everything) <= _FEWEST_TOGETHER:
@@ -187,7 +197,7 @@ def _chosen(
 _Enough = Callable[[Mapping[str, CameraSigmas]], bool]
 
 
-def _greedy(whitened: _Whitened, costs: Array, budget: float, enough: _Enough) -> tuple[list[int], str]:
+def _greedy(whitened: WhitenedInformation, costs: Array, budget: float, enough: _Enough) -> tuple[list[int], str]:
     """The best piece of a few stretches, then the stretch that tells most per CPU-second, again and again."""
     chosen = list(_best_window(whitened, _FEWEST_TOGETHER))
     spent = float(costs[chosen].sum())
@@ -211,7 +221,7 @@ def _greedy(whitened: _Whitened, costs: Array, budget: float, enough: _Enough) -
     return chosen, "enough" if enough(whitened.sigmas(chosen)) else ""
 
 
-def _window(whitened: _Whitened, costs: Array, budget: float, enough: _Enough) -> tuple[list[int], str]:
+def _window(whitened: WhitenedInformation, costs: Array, budget: float, enough: _Enough) -> tuple[list[int], str]:
     """The shortest piece that is enough, among pieces that grow by a quarter."""
     length, last = _FEWEST_TOGETHER, list(_best_window(whitened, _FEWEST_TOGETHER))
     while not enough(whitened.sigmas(last)):
@@ -225,7 +235,7 @@ def _window(whitened: _Whitened, costs: Array, budget: float, enough: _Enough) -
     return last, "enough"
 
 
-def _best_window(whitened: _Whitened, length: int) -> range:
+def _best_window(whitened: WhitenedInformation, length: int) -> range:
     """The rows in a piece that tell most."""
     total = np.concatenate([np.zeros_like(whitened.matrices[:1]), np.cumsum(whitened.matrices, axis=0)])
     sums = total[length:] - total[:-length] + whitened.prior

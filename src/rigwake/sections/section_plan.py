@@ -18,7 +18,7 @@ from rigwake.recording import CameraStream, GnssStream, ImuStream
 from rigwake.sections.calibration_cost import CalibrationCost, fixed_cost, machine_speed, stretch_costs
 from rigwake.sections.expected_motion import expected_motion
 from rigwake.sections.predicted_problem import ForecastSensors, TrackingForecast
-from rigwake.sections.section_choice import Precision, SectionChoice, choose_sections
+from rigwake.sections.section_choice import Precision, SectionChoice, choose_sections, tells_no_place
 from rigwake.sections.stretch_information import StretchInformation, stretch_information, stretch_spans
 
 STRETCH_S = 8.0
@@ -101,6 +101,12 @@ def plan_sections(
     information = stretch_information(
         motion, sensors, forecast, spans, texture, lambda done, total: progress("predicting", done, total)
     )
+    if tells_no_place(information):
+        raise UnobservableError(
+            "The vessel hardly turns in this recording: no camera's place could be told.",
+            consequence="Not a picture was tracked.",
+            remedy="Record turns to both sides, a figure of eight is best; see `rigwake inspect`.",
+        )
     fixed, costs = fixed_cost(cameras, across_cameras=adjustment.cross_camera), stretch_costs(cameras, spans)
     long_enough = (end - begin) * 1e-9 > USE_ALL_BELOW_S
     budget = wish.budget_s if wish.budget_s is not None else DEFAULT_BUDGET_S
@@ -114,20 +120,9 @@ def plan_sections(
         if wish.everything
         else ("it is short" if wish.is_default and not long_enough else ""),
     )
-    refuse_untold(choice)
     speed = machine_speed()
     cost = CalibrationCost(fixed, float(costs[choice.stretches].sum()), speed)
     return SectionPlan(information, choice, cost, CalibrationCost(fixed, float(costs.sum()), speed), texture)
-
-
-def refuse_untold(choice: SectionChoice) -> None:
-    """Raises UnobservableError where the motion tells no camera's rotation, or no camera's place, along any axis."""
-    if choice.whole and all(sigmas.undetermined >= 3 for sigmas in choice.whole.values()):
-        raise UnobservableError(
-            "The vessel hardly turns in this recording: no camera's place could be told.",
-            consequence="Not a picture was tracked.",
-            remedy="Record turns to both sides, a figure of eight is best; see `rigwake inspect`.",
-        )
 
 
 def texture_over_time(

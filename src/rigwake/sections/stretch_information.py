@@ -70,7 +70,7 @@ def stretch_information(
     for row, span in enumerate(spans_ns.tolist()):
         if texture[row].any():
             problem = predicted_problem(motion, sensors, forecast, (span[0], span[1]), texture[row], row)
-            matrices[row] = _information(problem, parameters, size)
+            matrices[row] = information_about(problem, parameters, size)
         progress(row + 1, len(spans_ns))
     prior = np.zeros((size, size))
     for (owner, parameter), columns in parameters.items():
@@ -92,7 +92,7 @@ def _parameters(sensors: ForecastSensors) -> dict[OwnedParameter, slice]:
     return {key: slice(end - width, end) for (key, width), end in zip(widths, ends, strict=True)}
 
 
-def _information(problem: RigProblem, parameters: dict[OwnedParameter, slice], size: int) -> Array:
+def information_about(problem: RigProblem, parameters: dict[OwnedParameter, slice], size: int) -> Array:
     """The problem's information about the parameters, what else it shares (errors of the receiver) marginalised."""
     if not len(problem.observations):
         return np.zeros((size, size))
