@@ -24,6 +24,7 @@ from rigwake.ba.rig.rig_values import AdjustmentOptions, InitialValues, RigMeasu
 from rigwake.ba.solver.covariance import covariance_of
 from rigwake.ba.solver.rig_problem import BundleCamera
 from rigwake.config import load_config
+from rigwake.excerpt import gnss_between, imu_between
 from rigwake.odometry.imu_alignment import with_noise
 from rigwake.pipeline.section_stage import with_chosen_sections
 from rigwake.pipeline.stream_selection import select
@@ -57,8 +58,7 @@ def simulation(seconds: float, cameras: int, manoeuvres: list[dict[str, Any]], w
     document = load_scenario("demo").model_dump()
     fisheyes = document["cameras"]
     document["cameras"] = [
-        fisheyes[n % 4]
-        | {"name": f"cam{n}", "yaw_deg": 360 * n / cameras - 180 + 1.0, "rate_hz": 5}
+        fisheyes[n % 4] | {"name": f"cam{n}", "yaw_deg": 360 * n / cameras - 180 + 1.0, "rate_hz": 5}
         for n in range(cameras)
     ]
     document["tracking"] |= {"features": 60, "landmarks": 1000, "outliers": 0.005, "water": 0.0}
@@ -89,7 +89,9 @@ def first_values(recording: Recording, turn_deg: float, shift_m: float) -> Initi
     return InitialValues(path, cameras, antenna_rig=truth.antenna_rig)
 
 
-def told_by_tracks(simulated: Simulation, recording: Recording, forecast: StretchInformation) -> StretchInformation:
+def told_by_tracks(
+    simulated: Simulation, recording: Recording, forecast: StretchInformation
+) -> StretchInformation:
     """What each stretch really tells: the information of the adjustment of its tracks, at the truth."""
     start = first_values(recording, 0.0, 0.0)
     imu, gnss = with_noise(next(iter(recording.imus.values()))), next(iter(recording.gnss.values()))
@@ -97,8 +99,6 @@ def told_by_tracks(simulated: Simulation, recording: Recording, forecast: Stretc
     matrices = np.zeros_like(forecast.matrices)
     for row, span in enumerate((forecast.spans_ns - simulated.start_ns) * 1e-9):
         tracks = tracks_within(simulated, [tuple(span.tolist())])
-        from rigwake.excerpt import gnss_between, imu_between
-
         begin, end = forecast.spans_ns[row].tolist()
         measured = RigMeasurements(
             tracks, imu_between(imu, begin - 10**9, end + 10**9), gnss_between(gnss, (begin, end))
@@ -149,7 +149,9 @@ def compare_sections(minutes: float, waves_m: float) -> None:
         by = found["chosen"]
         print(f"| {name} | {deg:.4f} | {mm:.2f} | {deg / by[0]:.2f} | {mm / by[1]:.2f} |")
     begun = cpu_s()
-    spans = [((a - simulated.start_ns) * 1e-9, (b - simulated.start_ns) * 1e-9) for a, b in plan.choice.sections_ns]
+    spans = [
+        ((a - simulated.start_ns) * 1e-9, (b - simulated.start_ns) * 1e-9) for a, b in plan.choice.sections_ns
+    ]
     adjust_and_print(simulated, recording, spans, begun)
 
 
@@ -159,9 +161,9 @@ def adjust_and_print(
     """Adjust the rig from the tracks of these spans, and print how far it is off."""
     tracks = tracks_within(simulated, spans_s)
     imu, gnss = with_noise(next(iter(recording.imus.values()))), next(iter(recording.gnss.values()))
-    from rigwake.excerpt import gnss_between
-
-    nanoseconds = [(simulated.start_ns + round(a * 1e9), simulated.start_ns + round(b * 1e9)) for a, b in spans_s]
+    nanoseconds = [
+        (simulated.start_ns + round(a * 1e9), simulated.start_ns + round(b * 1e9)) for a, b in spans_s
+    ]
     measured = RigMeasurements(tracks, imu, gnss_between(gnss, *nanoseconds))
     options = AdjustmentOptions(cross_camera=False)
     simulated_s, begun = cpu_s() - begun, cpu_s()

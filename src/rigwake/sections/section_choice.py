@@ -65,9 +65,7 @@ class WhitenedInformation:
     others no choice makes a difference worth its time.
     """
 
-    def __init__(
-        self, information: StretchInformation, limits: tuple[float, float] = _WORTH_KNOWING
-    ) -> None:
+    def __init__(self, information: StretchInformation, limits: tuple[float, float] = _WORTH_KNOWING) -> None:
         total = information.of(np.arange(len(information)))
         scale = np.sqrt(np.maximum(np.diag(total), _TINY))
         # what nothing tells is given next to nothing, so that all can be inverted
@@ -76,7 +74,9 @@ class WhitenedInformation:
         self.basis = vectors / scale[:, None] / np.sqrt(np.maximum(values, _TINY))
         weak = _TINY * np.diag(scale**2)
         self.prior = np.asarray(self.basis.T @ (information.prior + weak) @ self.basis)
-        self.matrices = np.einsum("ka,skl,lb->sab", self.basis, information.matrices, self.basis, optimize=True)
+        self.matrices = np.einsum(
+            "ka,skl,lb->sab", self.basis, information.matrices, self.basis, optimize=True
+        )
         self.parts: dict[str, tuple[tuple[slice, Array], ...]] = {}
         for name in information.cameras:
             first = information.parameters[name, "rig_from_cam"].start
@@ -197,7 +197,9 @@ def _chosen(
 _Enough = Callable[[Mapping[str, CameraSigmas]], bool]
 
 
-def _greedy(whitened: WhitenedInformation, costs: Array, budget: float, enough: _Enough) -> tuple[list[int], str]:
+def _greedy(
+    whitened: WhitenedInformation, costs: Array, budget: float, enough: _Enough
+) -> tuple[list[int], str]:
     """The best piece of a few stretches, then the stretch that tells most per CPU-second, again and again."""
     chosen = list(_best_window(whitened, _FEWEST_TOGETHER))
     spent = float(costs[chosen].sum())
@@ -221,7 +223,9 @@ def _greedy(whitened: WhitenedInformation, costs: Array, budget: float, enough: 
     return chosen, "enough" if enough(whitened.sigmas(chosen)) else ""
 
 
-def _window(whitened: WhitenedInformation, costs: Array, budget: float, enough: _Enough) -> tuple[list[int], str]:
+def _window(
+    whitened: WhitenedInformation, costs: Array, budget: float, enough: _Enough
+) -> tuple[list[int], str]:
     """The shortest piece that is enough, among pieces that grow by a quarter."""
     length, last = _FEWEST_TOGETHER, list(_best_window(whitened, _FEWEST_TOGETHER))
     while not enough(whitened.sigmas(last)):

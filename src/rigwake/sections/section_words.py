@@ -55,7 +55,9 @@ def duration_words(seconds: float) -> str:
 def sigma_words(sigmas: CameraSigmas) -> str:
     """`0.012 deg, 3.4 mm`, and what cannot be told."""
     words = f"{np.degrees(sigmas.rotation):.3f} deg, {1e3 * sigmas.translation:.1f} mm"
-    return words + (f" ({sigmas.undetermined} of 6 axes not told to 1 deg and 20 cm)" if sigmas.undetermined else "")
+    return words + (
+        f" ({sigmas.undetermined} of 6 axes not told to 1 deg and 20 cm)" if sigmas.undetermined else ""
+    )
 
 
 def choice_words(plan: SectionPlan) -> str:
