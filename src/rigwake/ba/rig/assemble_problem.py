@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,6 +40,7 @@ def assemble_problem(
     Raises EstimationError when no camera has tracks within the span of the rig's trajectory.
     """
     states = _states(measurements, start, options)
+    options = _within_bounds(options, states, len(start.cameras))
     parts = [
         _observe(index, camera, measurements.tracks[name], states, options)
         for index, (name, camera) in enumerate(start.cameras.items())
@@ -56,6 +59,13 @@ def assemble_problem(
         attitude=measurements.attitude,
     )
     return AssembledProblem(with_receiver_errors(problem), track_cameras, track_ids)
+
+
+def _within_bounds(options: AdjustmentOptions, states: States, cameras: int) -> AdjustmentOptions:
+    """The options with as many tracks per second as `most_tracks` allows."""
+    seconds = len(np.unique(states.timestamps_ns // 10**9))
+    affordable = options.most_tracks // max(seconds * cameras, 1)
+    return replace(options, tracks_per_second=max(min(options.tracks_per_second, affordable), 1))
 
 
 def _antenna(measurements: RigMeasurements, start: InitialValues) -> Antenna:
