@@ -225,7 +225,9 @@ def _first_states(problem: RigProblem) -> Indices:
     """(L,) the state at which each landmark was first seen."""
     seen, count = problem.observations, len(problem.states)
     first = np.full(len(problem.landmarks), count)
-    np.minimum.at(first, seen.landmark_indices, np.searchsorted(problem.states.timestamps_ns, seen.timestamps_ns))
+    np.minimum.at(
+        first, seen.landmark_indices, np.searchsorted(problem.states.timestamps_ns, seen.timestamps_ns)
+    )
     return first
 
 

@@ -36,14 +36,16 @@ def clustered_scatter(
         [-response, np.eye(k), np.zeros((1, k))]
     )  # the last row serves columns that are held
     jacobian, columns = poses.chain(layout)
-    by_frame = np.einsum("fia,fak->fik", jacobian, score[columns])
     observed, predicted = np.zeros((k, k)), np.zeros((k, k))
     starts = observations.landmark_starts
     for first, last in _chunks(starts):
         rows = slice(starts[first], starts[last])
         if rows.start == rows.stop:
             continue
-        G = observations.by_frame[rows] @ by_frame[observations.frames[rows]]
+        # of the frames at hand alone: for all of them at once it would not fit into memory
+        used, at = np.unique(observations.frames[rows], return_inverse=True)
+        by_frame = np.einsum("fia,fak->fik", jacobian[used], score[columns[used]])
+        G = observations.by_frame[rows] @ by_frame[at]
         if observations.by_extras.shape[2]:
             extras = observations.extras[rows]
             index = np.where(extras >= 0, layout.extras_start + extras, n + k)

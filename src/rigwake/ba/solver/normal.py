@@ -290,7 +290,18 @@ def _scatter_coupling(coupling, jacobian, columns, n, border, corner):  # type: 
 
 @njit(cache=True, nogil=True)
 def _scatter_shared(  # type: ignore[no-untyped-def]
-    origin, begin, end, blocks, row_starts, partners, rows, column_starts, columns, shared, by_shared, coupling
+    origin,
+    begin,
+    end,
+    blocks,
+    row_starts,
+    partners,
+    rows,
+    column_starts,
+    columns,
+    shared,
+    by_shared,
+    coupling,
 ):
     """Add `(S B_g)^T` of every pair with g to `coupling` of f - origin, whichever of the two is later."""
     for f in range(begin, end):
