@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from rigwake.config import CalibrateConfig
 from rigwake.errors import RigwakeError, UnobservableError
 from rigwake.pipeline.stream_selection import Selection, select
@@ -37,9 +39,9 @@ def with_chosen_sections(
     wish = section_wish(config)
     if wish.everything or (wish.is_default and _seconds(selection) <= USE_ALL_BELOW_S):
         return selection, None
-    plan = plan_sections(selection.cameras, selection.imu, selection.gnss, wish, config.adjustment, progress)
-    if plan is None:
-        return replace(selection, notes=(*selection.notes, _UNTOLD)), None
+    plan = _plan(selection, config, progress)
+    if isinstance(plan, str):
+        return replace(selection, notes=(*selection.notes, plan)), None
     cameras, gnss = cut_to_sections(plan, selection.cameras, selection.gnss)
     if not cameras:
         raise UnobservableError(
@@ -64,13 +66,25 @@ def planned_sections(
 ) -> SectionPlan | str:
     """What `calibrate` would use of a recording with these settings, and what that predicts; or why nobody can tell."""
     try:
-        selection = select(recording, config)
-        wish = section_wish(config)
-        plan = plan_sections(
-            selection.cameras, selection.imu, selection.gnss, wish, config.adjustment, progress
-        )
+        return _plan(select(recording, config), config, progress)
     except RigwakeError as error:
         return error.cause
+
+
+def _plan(selection: Selection, config: CalibrateConfig, progress: Progress) -> SectionPlan | str:
+    """The plan, or why there is none; then all is used."""
+    try:
+        plan = plan_sections(
+            selection.cameras,
+            selection.imu,
+            selection.gnss,
+            section_wish(config),
+            config.adjustment,
+            progress,
+        )
+    except (ArithmeticError, IndexError, ValueError, np.linalg.LinAlgError) as error:
+        # a forecast that fails must not stop a calibration that may not
+        return f"sections were not chosen: a fault of the program, please report it ({type(error).__name__}: {error})"
     return _UNTOLD if plan is None else plan
 
 

@@ -146,8 +146,8 @@ def choose_sections(
     chosen, reason = pick(whitened, costs, afford, enough)
     words = {
         "enough": why_enough,
-        "budget": f"the CPU time for them is {afford:.0f} s at most",
-        "": "nothing is left",
+        "budget": "more would take more CPU time than allowed",
+        "": "nothing else is left",
     }
     return _chosen(information, sorted(chosen), whitened.sigmas(chosen), whole, words[reason])
 

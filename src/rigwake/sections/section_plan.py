@@ -76,7 +76,7 @@ def plan_sections(
     One picture per stretch and camera is looked at, for whether it shows anything. Raises UnobservableError where even
     the whole recording tells nothing of any camera.
     """
-    models = {name: camera.model for name, camera in cameras.items() if camera.model is not None}
+    models = {name: c.model for name, c in cameras.items() if c.model is not None and len(c)}
     if imu is not None:
         imu = with_noise(vet_samples(imu).imu)
     motion = expected_motion(imu, gnss)

@@ -50,9 +50,8 @@ def visual_rotations(stream: CameraStream, *, frames: int = 150) -> Trajectory:
     stamps: list[int] = []
     rotations, segments = [np.eye(3)], [0]
     pairs = pairwise(stream.frames(np.arange(start, start + count)))
-    for before_ns, after_ns, turn in in_order(
-        partial(_turn, rays=ReducedRays(stream.model, 2**octaves), octaves=octaves, usable=usable), pairs
-    ):
+    turn_of = partial(_turn, rays=ReducedRays(stream.model, 2**octaves), octaves=octaves, usable=usable)
+    for before_ns, after_ns, turn in in_order(turn_of, pairs):
         rotations.append(rotations[-1] @ (np.eye(3) if turn is None else turn.T))
         segments.append(segments[-1] + (turn is None))
         stamps += [after_ns] if stamps else [before_ns, after_ns]
