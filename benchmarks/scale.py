@@ -172,19 +172,22 @@ def adjust_and_print(
     problem = adjusted.solution.problem
     covariance = covariance_of(problem, clustered=True)
     truth = rig_in_frame(recording.true_rig, "imu")  # type: ignore[arg-type]
-    errors, nees = [], []
+    errors, sigmas, nees = [], [], []
     for camera in problem.cameras:
         off = truth.cameras[camera.name].rig_from_cam.local(camera.rig_from_cam)
         spread, told = covariance.of(covariance.rows_of(camera.name, "rig_from_cam"))
-        errors.append(off)
-        if told.all():
-            nees.append(float(off @ np.linalg.solve(spread, off)))
-    off = np.abs(np.array(errors))
+        errors.append(np.where(told, np.abs(off), 0.0))
+        sigmas.append(np.where(told, np.sqrt(np.diag(spread)), 0.0))
+        inverse = np.linalg.pinv(spread[np.ix_(told, told)], hermitian=True)
+        nees.append(float(off[told] @ inverse @ off[told]) / max(int(told.sum()), 1))
+    worst_of = {}
+    for what, values in (("errors", np.array(errors)), ("sigmas", np.array(sigmas))):
+        worst_of[what] = f"{np.degrees(values[:, :3].max()):.4f} deg, {1e3 * values[:, 3:].max():.1f} mm"
     print(
         f"adjusted: {len(problem.states)} states, {len(problem.observations)} observations, "
-        f"{cpu_s() - begun:.0f} CPU-s (tracks {simulated_s:.0f}), {peak_gb():.2f} GB; worst axis "
-        f"{np.degrees(off[:, :3].max()):.4f} deg, {1e3 * off[:, 3:].max():.1f} mm; "
-        f"NEES {np.mean(nees) if nees else np.nan:.1f} of 6"
+        f"{cpu_s() - begun:.0f} CPU-s (tracks {simulated_s:.0f}), {peak_gb():.2f} GB; worst axes: errors "
+        f"{worst_of['errors']}; sigmas {worst_of['sigmas']}; NEES {np.mean(nees):.2f} per axis",
+        flush=True,
     )
 
 
