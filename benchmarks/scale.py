@@ -185,7 +185,7 @@ def adjust_and_print(
         worst_of[what] = f"{np.degrees(values[:, :3].max()):.4f} deg, {1e3 * values[:, 3:].max():.1f} mm"
     print(
         f"adjusted: {len(problem.states)} states, {len(problem.observations)} observations, "
-        f"{cpu_s() - begun:.0f} CPU-s (tracks {simulated_s:.0f}), {peak_gb():.2f} GB; worst axes: errors "
+        f"{cpu_s() - begun:.1f} CPU-s (tracks {simulated_s:.0f}), {peak_gb():.2f} GB; worst axes: errors "
         f"{worst_of['errors']}; sigmas {worst_of['sigmas']}; NEES {np.mean(nees):.2f} per axis",
         flush=True,
     )
