@@ -35,6 +35,17 @@ def test_portions_of_frames_give_the_same_information(
     assert np.allclose(parts.of(rows)[0], whole.of(rows)[0], rtol=1e-6, atol=1e-14)
 
 
+def test_a_sample_of_landmarks_tells_how_their_scores_scatter(
+    rig: RigProblem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = covariance_of(rig).rows_of("cam0", "rig_from_cam")
+    whole = np.sqrt(np.diag(covariance_of(rig, clustered=True).of(rows)[0]))
+    monkeypatch.setattr(clusters, "_MOST", len(rig.observations) // 2)
+    monkeypatch.setattr(clusters, "_SAMPLED", 20)
+    sampled = np.sqrt(np.diag(covariance_of(rig, clustered=True).of(rows)[0]))
+    assert np.abs(np.log(sampled / whole)).max() < 0.4
+
+
 def test_landmarks_are_looked_for_within_reach_alone(
     rig: RigProblem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
