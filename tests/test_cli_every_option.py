@@ -31,6 +31,8 @@ USED = [
         0,
         "seed: 5",
     ),
+    ("calibrate --print-config --precision 5mm,0.02deg --budget 120", 0, "budget_s: 120"),
+    ("calibrate --print-config --all", 0, "use_all: true"),
     ("calibrate --print-config --seed 7 --config {settings}", 0, "min_duration_s: 2"),
     (
         "calibrate {images} -o {here}/c1 --topic camera.front=/a --topics {topics} --allow-partial",

@@ -40,6 +40,7 @@ LAYERS = [
     ["handeye"],
     ["ba.rig"],  # the rig problem: initial values, cross-camera association, rounds of outlier rejection
     ["plausibility"],  # does a sensor agree with the others?
+    ["sections"],  # which parts of a long recording are worth calibrating from
     ["simulation"],
     ["exporters"],
     ["report"],

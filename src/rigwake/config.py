@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from rigwake.ba.rig.intrinsics_refinement import IntrinsicsChoice
 from rigwake.ba.rig.rig_values import AdjustmentOptions
@@ -14,6 +14,7 @@ from rigwake.ba.rig.search_proposals import AssociationOptions
 from rigwake.errors import InputError, UsageError
 from rigwake.odometry.below_horizon import HorizonChoice
 from rigwake.odometry.odometry_options import OdometryOptions
+from rigwake.sections.section_words import parse_precision
 from rigwake.tracking.tracking_options import TrackingOptions
 from rigwake.yaml_input import parse_yaml, read_yaml_settings
 
@@ -42,6 +43,8 @@ class CalibrateConfig(BaseModel):
     sensor_checks: compare every sensor with the others; repair: correct units, leave out samples that cannot be right.
     horizon: leave out what lies below the horizon (needs an IMU): on, off, or auto (where it is water).
     intrinsics: fixed (as given), or refine (with the rig, about what was given).
+    use_all: use all of the recording; precision: else enough of it for these predicted sigmas of every camera (`5mm`,
+    `0.02deg` or both); budget_s: CPU-seconds that it may take.
     line_delay_s: read-out time per row of rolling shutters, by camera; estimate_line_delay: refine it.
     """
 
@@ -55,6 +58,9 @@ class CalibrateConfig(BaseModel):
     jobs: int = Field(default=0, ge=0)
     seed: int = 0
     time_offsets: bool = True
+    use_all: bool = False
+    precision: str | None = None
+    budget_s: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     imu: bool = True
     gnss: bool = True
     find_self_mask: bool = True
@@ -70,6 +76,13 @@ class CalibrateConfig(BaseModel):
     odometry: OdometryOptions = OdometryOptions(adjust_all_frames=False)
     adjustment: AdjustmentOptions = AdjustmentOptions()
     association: AssociationOptions = AssociationOptions()
+
+    @field_validator("precision")
+    @classmethod
+    def _is_precision(cls, given: str | None) -> str | None:
+        if given is not None:
+            parse_precision(given)
+        return given
 
 
 def load_config(file: Path | None = None, assignments: Sequence[str] = (), **options: Any) -> CalibrateConfig:

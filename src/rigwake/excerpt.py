@@ -163,6 +163,28 @@ def _fixes_at(gnss: GnssStream, rows: Indices) -> GnssStream:
     )
 
 
+def imu_between(imu: ImuStream, begin_ns: int, end_ns: int) -> ImuStream:
+    """The inertial samples from `begin_ns` to `end_ns`, both included."""
+    return _imu_at(imu, _rows_within(imu.timestamps_ns, [(begin_ns, end_ns)]))
+
+
+def gnss_between(gnss: GnssStream, *spans_ns: tuple[int, int]) -> GnssStream:
+    """The fixes within any of these spans (begin, end), both included."""
+    return _fixes_at(gnss, _rows_within(gnss.timestamps_ns, spans_ns))
+
+
+def camera_between(camera: CameraStream, spans_ns: Sequence[tuple[int, int]]) -> CameraStream:
+    """The frames within any of these spans (begin, end), both included; no other is ever read."""
+    return _frames_at(camera, _rows_within(camera.timestamps_ns, spans_ns))
+
+
+def _rows_within(stamps: Stamps, spans_ns: Sequence[tuple[int, int]]) -> Indices:
+    inside = np.zeros(len(stamps), dtype=bool)
+    for begin, end in spans_ns:
+        inside[np.searchsorted(stamps, begin) : np.searchsorted(stamps, end, side="right")] = True
+    return np.flatnonzero(inside)
+
+
 def _attitudes_at(attitude: AttitudeStream, rows: Indices) -> AttitudeStream:
     return replace(
         attitude,

@@ -39,7 +39,7 @@ def over_ranges(bounds: NDArray[np.int64], work: Callable[[int, int], None]) -> 
     """Call `work(first, last)` for every range; here if there is only one, else on the threads, which all such loops
     share. Within one of these threads, the ranges follow one another."""
     if len(bounds) <= 2:
-        work(0, int(bounds[-1]))
+        work(int(bounds[0]), int(bounds[-1]))
         return
     first, last = bounds[:-1].tolist(), bounds[1:].tolist()
     list(map(work, first, last) if _on_a_thread() else _threads().map(work, first, last))

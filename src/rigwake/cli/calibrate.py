@@ -52,6 +52,14 @@ def command(
     cameras: Annotated[str | None, typer.Option(help="Only these cameras, separated by commas.")] = None,
     start: Annotated[float | None, typer.Option(help="Skip so many seconds.")] = None,
     duration: Annotated[float | None, typer.Option(help="Use so many seconds.")] = None,
+    precision: Annotated[
+        str | None,
+        typer.Option(help="Use as much as every camera needs for these sigmas: 5mm, 0.02deg or 5mm,0.02deg."),
+    ] = None,
+    budget: Annotated[
+        float | None, typer.Option(help="CPU-seconds it may take (default of recordings over 60 s: 300).")
+    ] = None,
+    use_all: Annotated[bool, typer.Option("--all", help="Use all of a long recording.")] = False,
     prior: Annotated[
         Path | None, typer.Option(help="YAML of what is known: tape measures, baselines.")
     ] = None,
@@ -98,6 +106,11 @@ def command(
     Example: [cyan]rigwake calibrate sail.mcap -o OUT --reference base_link --prior tape.yaml[/cyan]
     """
     require_there(recording, config, prior, trajectories, topics)
+    if use_all and (precision is not None or budget is not None):
+        raise UsageError(
+            "--all uses all of the recording, --precision and --budget a part of it.",
+            remedy="Give one of them.",
+        )
     if recording is not None:
         require_writable("-o", out_folder, folder=True)
         require_writable("--json", json_file)
@@ -116,6 +129,9 @@ def command(
         cameras=None if cameras is None else [name.strip() for name in cameras.split(",") if name.strip()],
         start_s=start,
         duration_s=duration,
+        precision=precision,
+        budget_s=budget,
+        use_all=use_all or None,
         intrinsics=intrinsics,
         horizon=None if horizon == "auto" else horizon_choice(horizon),
         jobs=jobs,

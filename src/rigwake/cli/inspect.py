@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rigwake.inspection.readiness import Readiness
     from rigwake.inspection.recording_inspection import Inspection
     from rigwake.inspection.time_offsets import SensorTimeOffset
+    from rigwake.sections.section_plan import SectionPlan
 
 _COLOURS = {"enough": "green", "partly": "yellow", "not enough": "red"}
 _SEVERITIES = {"note": "dim", "warning": "yellow", "error": "red"}
@@ -50,12 +51,15 @@ def command(
     require_there(recording, topics)
     require_writable("--json", json_file)
     require_writable("--html", html)
+    from rigwake.config import CalibrateConfig
     from rigwake.inspection.inspection_summary import inspection_to_dict
     from rigwake.pipeline.checked_inspection import inspect_with_checks
+    from rigwake.pipeline.section_stage import planned_sections
     from rigwake.plausibility.values import checks_to_list
     from rigwake.readers.open import open_recording
     from rigwake.readers.topics import TopicMap
     from rigwake.report.inspection_page import inspection_page
+    from rigwake.sections.section_words import plan_to_dict, told_over_time
 
     opened = open_recording(recording, TopicMap.from_options(topic or (), topics, camera_file or ()))
     with progress_bar() as bar:
@@ -64,15 +68,23 @@ def command(
             opened,
             lambda text, done, total: bar.update(task, description=escape(text), completed=done, total=total),
         )
+        plan = planned_sections(
+            opened,
+            CalibrateConfig(),
+            lambda text, done, total: bar.update(task, description=escape(text), completed=done, total=total),
+        )
     wrong = [check for check in checks if not check.agrees]
     if json_file is not None:
-        write_json(
-            json_file, inspection_to_dict(inspection, verdict) | {"sensor_checks": checks_to_list(checks)}
-        )
+        sections = {"unknown": plan} if isinstance(plan, str) else plan_to_dict(plan)
+        content = inspection_to_dict(inspection, verdict)
+        write_json(json_file, content | {"sensor_checks": checks_to_list(checks), "sections": sections})
     if html is not None:
-        write_text_atomic(html, inspection_page(inspection, verdict))
+        told = None if isinstance(plan, str) else told_over_time(plan)
+        write_text_atomic(html, inspection_page(inspection, verdict, told))
     if str(json_file) != "-":
         _print(inspection, verdict)
+        if not isinstance(plan, str):
+            _print_plan(plan)
         given = topic_words(topic, topics)
         if verdict.word != "not enough":
             next_step(["rigwake", "calibrate", recording, *given, "-o", "OUT"], "estimate the rig")
@@ -105,6 +117,25 @@ def _print(inspection: Inspection, verdict: Readiness) -> None:
     out.print(f"\n[bold {_COLOURS[verdict.word]}]{escape(verdict.summary)}[/]")
     for line in verdict.advice:
         out.print(f"  → {escape(line)}", soft_wrap=True)
+
+
+def _print_plan(plan: SectionPlan) -> None:
+    """Information over time, what `calibrate` would use, what that predicts, and what it costs."""
+    from rigwake.sections.section_words import (
+        choice_words,
+        duration_words,
+        information_line,
+        sigma_words,
+    )
+
+    out.print(f"\ninformation over time  [cyan]{information_line(plan)}[/cyan]", soft_wrap=True)
+    out.print(escape(choice_words(plan)), soft_wrap=True)
+    for name, sigmas in plan.choice.predicted.items():
+        of_all = "" if plan.is_all else f"  [dim](all of it: {sigma_words(plan.choice.whole[name])})[/dim]"
+        out.print(f"  {escape(name)}: predicted sigmas {sigma_words(sigmas)}{of_all}", soft_wrap=True)
+    takes = duration_words(plan.cost.total_s)
+    of_all = "" if plan.is_all else f"; all of the recording about {duration_words(plan.whole_cost.total_s)}"
+    out.print(f"calibrating this takes about {takes} of CPU time{of_all}", soft_wrap=True)
 
 
 def _sensor_table(inspection: Inspection) -> Table:

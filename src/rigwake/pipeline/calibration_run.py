@@ -36,6 +36,7 @@ from rigwake.pipeline.camera_stage import (
 from rigwake.pipeline.out_folder import check_camera_names, check_out_folder, clear_results, used_by_one
 from rigwake.pipeline.outputs import write_outputs
 from rigwake.pipeline.prior import RigPrior
+from rigwake.pipeline.section_stage import with_chosen_sections
 from rigwake.pipeline.sensor_checks import vet_imu
 from rigwake.pipeline.stage_files import StageLedger
 from rigwake.pipeline.stream_selection import Selection, select
@@ -46,6 +47,7 @@ from rigwake.readers.topics import TopicMap
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.recording import Recording
 from rigwake.report import build_report, load_report_content
+from rigwake.sections.section_words import plan_to_dict
 from rigwake.tracks import load_tracks
 from rigwake.trajectory import Trajectory
 
@@ -76,7 +78,8 @@ def _silent(name: str, what: str, fraction: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """What a calibration starts with, everything checked. external: trajectories of another odometry, if given."""
+    """What a calibration starts with, everything checked. external: trajectories of another odometry, if given.
+    sections: what was chosen of a long recording, and why; empty where all is used."""
 
     path: Path
     opened: Recording
@@ -84,6 +87,7 @@ class _Prepared:
     external: Mapping[str, Trajectory] | None
     prior: RigPrior
     config: CalibrateConfig
+    sections: Mapping[str, Any] = field(default_factory=dict)
 
 
 def calibrate(
@@ -119,6 +123,7 @@ def calibrate(
             identity = input_fingerprint(path)
             provenance = _provenance(identity, prepared, topics, external)
             ledger = StageLedger(out, resume=resume)
+            prepared = _with_sections(prepared, progress)
             selection, outcomes, checks = _each_camera(prepared, out, ledger, identity, progress, run_cameras)
             check_unchanged()
             estimated = _estimate(prepared, out, selection, outcomes, progress)
@@ -138,6 +143,16 @@ def _prepare(
     check_line_delays(config, selection)
     given = None if external is None else read_external_trajectories(external, selection)
     return _Prepared(path, opened, selection, given, prior, config)
+
+
+def _with_sections(prepared: _Prepared, progress: Progress) -> _Prepared:
+    """Only the sections of a long recording that are worth their time; nothing else is read."""
+
+    def tell(words: str, done: int, total: int) -> None:
+        progress("rig", f"choosing sections: {words}", 0.0)
+
+    selection, plan = with_chosen_sections(prepared.selection, prepared.config, tell)
+    return replace(prepared, selection=selection, sections={} if plan is None else plan_to_dict(plan))
 
 
 def _estimate(
@@ -189,6 +204,7 @@ def _conclude(
             "failed_cameras": failed,
             "sensor_checks": checks_to_list(checks),
             "notes": list(notes),
+            **({"sections": dict(prepared.sections)} if prepared.sections else {}),
         },
         provenance={**provenance, "leader": first.reference_camera},
     )

@@ -24,6 +24,7 @@ _OUTLIER_STDS = 8.0
 _LEAST_JUMP_M, _JUMP_STDS = 0.5, 8.0
 _FEWEST = 12
 _STANDING_S, _LEAST_WAY_M = 2.0, 0.8
+_LONGEST_STEP_S = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,6 +221,8 @@ def _without_jumps(
     # a vessel's velocity changes by little from fix to fix; noise is in the median
     nearby = np.array([np.median(velocity[max(k - 4, 0) : k + 5], axis=0) for k in range(len(steps))])
     excess = np.linalg.norm(steps - nearby * seconds, axis=1)
+    # over a long gap, as between sections of a recording, nobody knows the velocity
+    excess[seconds[:, 0] > _LONGEST_STEP_S] = 0.0
     noise = robust_std(excess - np.median(excess))
     limit = max(_LEAST_JUMP_M, _JUMP_STDS * noise)
     jumps = np.flatnonzero(excess > limit)

@@ -12,6 +12,7 @@ from rigwake._types import Array
 from rigwake.inspection.readiness import Readiness
 from rigwake.inspection.recording_inspection import Inspection, sensors
 from rigwake.inspection.timing import periods_s
+from rigwake.inspection.told_over_time import ToldOverTime
 from rigwake.recording import main_gnss
 from rigwake.report.charts import Series, line_chart, top_view
 from rigwake.report.html_page import (
@@ -35,7 +36,9 @@ _TONES = {"enough": "good", "partly": "usable", "not enough": "lost"}
 _PASSED = {True: "yes", False: "no", None: "cannot tell"}
 
 
-def inspection_page(inspection: Inspection, readiness: Readiness) -> str:
+def inspection_page(
+    inspection: Inspection, readiness: Readiness, told: ToldOverTime | None = None
+) -> str:
     """The page; it loads nothing from elsewhere. Pictures that cannot be read are left out."""
     recording = inspection.recording
     checks = [[check.name, check.measured, _PASSED[check.passed]] for check in readiness.checks]
@@ -50,6 +53,7 @@ def inspection_page(inspection: Inspection, readiness: Readiness) -> str:
             card("Findings", table("Findings", ["", "sensor", "finding"], findings, words=(2,))),
             card("Pictures", grid(*_pictures(inspection))),
             _motion_card(inspection),
+            _information_card(inspection, told),
             _time_offsets_card(inspection),
         ],
         f"{recording.kind}. {_when(inspection)}",
@@ -165,6 +169,22 @@ def _motion_card(inspection: Inspection) -> Markup:
             figure(seen, "Path of the antenna from above; east to the right. The square is the start.")
         )
     return card("Motion", side_by_side(*charts))
+
+
+def _information_card(inspection: Inspection, told: ToldOverTime | None) -> Markup:
+    """What each stretch tells about the rig, and which of them `calibrate` would use."""
+    if told is None:
+        return Markup("")
+    begin = (told.starts_ns - _span_ns(inspection)[0]) * 1e-9
+    edges = np.stack([begin, begin + told.lengths_s], axis=1)
+    percent = 100 * told.told
+    series = [Series("", edges.ravel(), np.repeat(percent, 2))]
+    if told.chosen.any():
+        middle = edges.mean(axis=1)[told.chosen]
+        series.append(Series("", middle, percent[told.chosen], 1, is_dots=True))
+    title = "Information about the rig over time"
+    words = f"What each stretch tells, in percent of the whole; dots: stretches that would be used. {told.words}"
+    return card(title, figure(line_chart(title, "time, s", "% of all", series), words))
 
 
 def _time_offsets_card(inspection: Inspection) -> Markup:

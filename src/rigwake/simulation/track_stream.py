@@ -6,7 +6,7 @@ lose its clock or catch a drop of water on its lens.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
@@ -97,6 +97,42 @@ def stream_tracks(
                 for index, camera in enumerate(scenario.cameras)
             },
         )
+
+
+def tracks_within(
+    simulation: Simulation, spans_s: Sequence[tuple[float, float]], landmarks: Array | None = None
+) -> dict[str, Tracks]:
+    """Tracks by camera of these spans (s since the start, in order) alone; nothing is followed from one to the next.
+
+    landmarks: (L, 3), by default those of `simulate_tracks`.
+    """
+    scenario = simulation.scenario
+    if landmarks is None:
+        landmarks = sample_landmarks(simulation.layout, simulation.rng(10), scenario.tracking.landmarks)
+    return {
+        camera.name: _joined(
+            [
+                _tracks(simulation, index, camera, landmarks, None, first, last, round(first * 1e3))
+                for first, last in spans_s
+            ]
+        )
+        for index, camera in enumerate(scenario.cameras)
+    }
+
+
+def _joined(pieces: Sequence[Tracks]) -> Tracks:
+    """Tracks of one camera one after the other, their frames and tracks numbered through."""
+    frames = np.cumsum([0, *(len(piece.timestamps_ns) for piece in pieces)])
+    ids = np.cumsum([0, *(int(piece.track_ids.max(initial=-1)) + 1 for piece in pieces)])
+    return Tracks(
+        pieces[0].camera,
+        np.concatenate([piece.timestamps_ns for piece in pieces]),
+        np.concatenate([p.frame_indices + first for p, first in zip(pieces, frames, strict=False)]),
+        np.concatenate([p.track_ids + first for p, first in zip(pieces, ids, strict=False)]),
+        np.concatenate([piece.pixels for piece in pieces]),
+        np.concatenate([piece.bearings_cam for piece in pieces]),
+        np.concatenate([piece.std_px for piece in pieces]),
+    )
 
 
 def _tracks(

@@ -12,7 +12,6 @@ from itertools import pairwise
 import numpy as np
 
 from rigwake._types import Array, Image, Mask
-from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import EstimationError, UsageError
 from rigwake.geometry.se3 import SE3
 from rigwake.parallel import in_order
@@ -20,6 +19,7 @@ from rigwake.recording import CameraStream, Frame
 from rigwake.tracking.features import detect_corners
 from rigwake.tracking.klt import follow, pyramid
 from rigwake.tracking.masks import beyond_lens
+from rigwake.tracking.picture_scale import ReducedRays, reduced
 from rigwake.tracking.warps import dominant_rotation
 from rigwake.trajectory import Trajectory
 
@@ -27,6 +27,7 @@ _CORNERS = 120
 _MIN_MATCHES = 12
 _WINDOW_PX, _LEVELS = 21, 4  # of the search
 _MAX_GAP_S = 0.5
+_WIDEST_PX = 1000  # larger pictures are halved: a degree shows in small ones too
 
 
 def visual_rotations(stream: CameraStream, *, frames: int = 150) -> Trajectory:
@@ -42,11 +43,15 @@ def visual_rotations(stream: CameraStream, *, frames: int = 150) -> Trajectory:
         )
     count = min(frames, len(stream))
     start = (len(stream) - count) // 2
-    usable = ~beyond_lens(stream.model)
+    octaves = 0
+    while stream.width_px / 2**octaves > _WIDEST_PX:
+        octaves += 1
+    usable = ~beyond_lens(stream.model)[:: 2**octaves, :: 2**octaves]
     stamps: list[int] = []
     rotations, segments = [np.eye(3)], [0]
     pairs = pairwise(stream.frames(np.arange(start, start + count)))
-    for before_ns, after_ns, turn in in_order(partial(_turn, model=stream.model, usable=usable), pairs):
+    turn_of = partial(_turn, rays=ReducedRays(stream.model, 2**octaves), octaves=octaves, usable=usable)
+    for before_ns, after_ns, turn in in_order(turn_of, pairs):
         rotations.append(rotations[-1] @ (np.eye(3) if turn is None else turn.T))
         segments.append(segments[-1] + (turn is None))
         stamps += [after_ns] if stamps else [before_ns, after_ns]
@@ -64,16 +69,20 @@ def visual_rotations(stream: CameraStream, *, frames: int = 150) -> Trajectory:
     )
 
 
-def _turn(pair: tuple[Frame, Frame], model: CameraModel, usable: Mask) -> tuple[int, int, Array | None]:
+def _turn(
+    pair: tuple[Frame, Frame], rays: ReducedRays, octaves: int, usable: Mask
+) -> tuple[int, int, Array | None]:
     """Stamps of two frames, and the rotation `after_from_before` (3, 3) that most corners agree on; None with too few
     of them, and across a gap."""
     before, after = pair
     near = (after.timestamp_ns - before.timestamp_ns) * 1e-9 <= _MAX_GAP_S
-    turn = _rotation(before.image, after.image, model, usable) if near else None
+    turn = None
+    if near:
+        turn = _rotation(reduced(before.image, octaves), reduced(after.image, octaves), rays, usable)
     return before.timestamp_ns, after.timestamp_ns, turn
 
 
-def _rotation(before: Image, after: Image, model: CameraModel, usable: Mask) -> Array | None:
+def _rotation(before: Image, after: Image, rays: ReducedRays, usable: Mask) -> Array | None:
     corners = detect_corners(
         before,
         usable,
@@ -87,8 +96,8 @@ def _rotation(before: Image, after: Image, model: CameraModel, usable: Mask) -> 
     landed, believed = follow(
         scales, later, corners, corners, window_px=_WINDOW_PX, max_forward_backward_px=0.5
     )
-    bearings_before, valid = model.unproject(corners)
-    bearings_after, still_valid = model.unproject(landed)
+    bearings_before, valid = rays.unproject(corners)
+    bearings_after, still_valid = rays.unproject(landed)
     good = believed & valid & still_valid
     if good.sum() < _MIN_MATCHES:
         return None

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rigwake._types import Array, Indices
 from rigwake.ba.rig.gnss_noise import with_receiver_errors
 from rigwake.ba.rig.rig_values import AdjustmentOptions, AssembledProblem, InitialRig, RigMeasurements
+from rigwake.ba.solver.preintegration import LONGEST_BRIDGE_S
 from rigwake.ba.solver.rig_problem import (
     Antenna,
     BundleCamera,
@@ -20,6 +23,7 @@ from rigwake.ba.solver.rig_problem import (
 )
 from rigwake.errors import EstimationError
 from rigwake.geometry.interpolate import TransformSpline, interpolate, nearest_indices
+from rigwake.geometry.se3 import SE3
 from rigwake.geometry.triangulation import triangulate_rays
 from rigwake.tracks import Tracks
 
@@ -36,6 +40,7 @@ def assemble_problem(
     Raises EstimationError when no camera has tracks within the span of the rig's trajectory.
     """
     states = _states(measurements, start, options)
+    options = _within_bounds(options, states, len(start.cameras))
     parts = [
         _observe(index, camera, measurements.tracks[name], states, options)
         for index, (name, camera) in enumerate(start.cameras.items())
@@ -54,6 +59,13 @@ def assemble_problem(
         attitude=measurements.attitude,
     )
     return AssembledProblem(with_receiver_errors(problem), track_cameras, track_ids)
+
+
+def _within_bounds(options: AdjustmentOptions, states: States, cameras: int) -> AdjustmentOptions:
+    """The options with as many tracks per second as `most_tracks` allows."""
+    seconds = len(np.unique(states.timestamps_ns // 10**9))
+    affordable = options.most_tracks // max(seconds * cameras, 1)
+    return replace(options, tracks_per_second=max(min(options.tracks_per_second, affordable), 1))
 
 
 def _antenna(measurements: RigMeasurements, start: InitialRig) -> Antenna:
@@ -99,10 +111,20 @@ def _states(measurements: RigMeasurements, start: InitialRig, options: Adjustmen
     if measurements.imu is None:
         return States(stamps, world_from_rig)
     # differentiating the thinned positions averages the noise of a dense trajectory
-    velocity = TransformSpline(stamps, world_from_rig).velocity_world(stamps)
+    velocity = _velocity(stamps, world_from_rig)
     n = len(stamps)
     inertial = InertialStates(velocity, np.tile(start.gyro_bias, (n, 1)), np.tile(start.accel_bias, (n, 1)))
     return States(stamps, world_from_rig, inertial)
+
+
+def _velocity(stamps: Indices, world_from_rig: SE3) -> Array:
+    """(N, 3) velocities in the world, section by section: nobody knows how the rig went from one to the next."""
+    velocity = np.zeros((len(stamps), 3))
+    breaks = np.flatnonzero(np.diff(stamps) > round(LONGEST_BRIDGE_S * 1e9)) + 1
+    for rows in np.split(np.arange(len(stamps)), breaks):
+        if len(rows) > 1:
+            velocity[rows] = TransformSpline(stamps[rows], world_from_rig[rows]).velocity_world(stamps[rows])
+    return velocity
 
 
 def _observe(
@@ -115,7 +137,10 @@ def _observe(
     nearest = nearest_indices(frame_stamps, at)
     gap_ns = np.abs(frame_stamps[nearest] - at)
     usual_ns = np.median(np.diff(at)) if len(at) > 1 else 1e9
-    frames = np.unique(nearest[gap_ns <= 0.6 * usual_ns])
+    near = gap_ns <= 0.6 * usual_ns
+    if states.inertial is None:
+        near &= ~_in_a_break(frame_stamps[nearest], at)
+    frames = np.unique(nearest[near])
     kept = np.isin(tracks.frame_indices, frames)
     counts = np.bincount(tracks.track_ids[kept], minlength=int(tracks.track_ids.max(initial=0)) + 1)
     kept &= counts[tracks.track_ids] >= options.min_observations
@@ -129,6 +154,13 @@ def _observe(
         tracks.std_px[rows],
     )
     return observations, chosen
+
+
+def _in_a_break(stamps: Indices, states: Indices) -> NDArray[np.bool_]:
+    """Which stamps lie between two states that are so far apart that nothing can be said of the way between."""
+    right = np.clip(np.searchsorted(states, stamps), 1, len(states) - 1)
+    inside = (stamps > states[right - 1]) & (stamps < states[right])
+    return np.asarray(inside & (states[right] - states[right - 1] > round(LONGEST_BRIDGE_S * 1e9)))
 
 
 def _longest_everywhere(tracks: Tracks, camera: BundleCamera, options: AdjustmentOptions) -> Indices:

@@ -23,7 +23,8 @@ class AdjustmentOptions:
     state_rate_hz: rig states per second; observations at the frames nearest to them are used. Without an IMU,
         which carries the motion between them, there are `state_rate_without_imu_hz`.
     tracks_per_second: most tracks per camera and second that take part, the longest of each part of the image
-        first. min_observations: fewest frames a track must be seen in.
+        first. most_tracks: in all, which bounds memory: of long recordings with many cameras fewer per second take
+        part. min_observations: fewest frames a track must be seen in.
     gate_stds: an observation further off than this many of its standard deviations is dropped between rounds.
     rounds: of solving and dropping. cross_camera: whether landmarks are matched across cameras and time.
     """
@@ -31,6 +32,7 @@ class AdjustmentOptions:
     state_rate_hz: float = 3.0
     state_rate_without_imu_hz: float = 10.0
     tracks_per_second: int = 60
+    most_tracks: int = 120_000
     min_observations: int = 3
     gate_stds: float = 4.0
     rounds: int = 2
@@ -41,6 +43,7 @@ class AdjustmentOptions:
             "state_rate_hz",
             "state_rate_without_imu_hz",
             "tracks_per_second",
+            "most_tracks",
             "gate_stds",
             "rounds",
         ):

@@ -23,6 +23,7 @@ from rigwake.tracking.masks import inside
 _STENCIL_PX = 2.0
 _STENCIL = _STENCIL_PX * np.array([[x, y] for y in (-1, 0, 1) for x in (-1, 0, 1)])  # row by row
 _PAIRS_AT_ONCE = 1_000_000  # of images and landmarks, to bound memory
+_REACH_COLUMNS = 2700  # of the normal equations: a minute of states with an IMU
 _NEAR = 1e-3  # 1 / metres: what lies further away says nothing about where cameras are
 
 
@@ -188,20 +189,31 @@ def _visible(
     options: AssociationOptions,
 ) -> tuple[Indices, Indices, Array]:
     """Which images of a camera (indices into `stamps`) may see which landmarks about as their sources do, and at
-    which pixels."""
+    which pixels.
+
+    A landmark is looked for within so many states of where it was first seen: what ties states that are far apart
+    makes time and memory of the adjustment grow with the square of the recording's length.
+    """
     model, points = problem.cameras[camera].model, problem.landmarks.points_world
     cam_from_world = camera_from_world(problem, camera, stamps)
     centres = cam_from_world.inverse().translation
     near = np.flatnonzero(problem.landmarks.inverse_ranges > _NEAR)
     sources, margin = _source_centres(problem, source), options.patch_radius_px + options.search_px
     last = np.array([model.width_px, model.height_px]) - 1 - margin
+    reach = _REACH_COLUMNS // (6 if problem.imu is None else 15)
+    states_of_images = np.searchsorted(problem.states.timestamps_ns, stamps)
+    states_of_near = _first_states(problem)[near]
     found = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)))]
     step = max(_PAIRS_AT_ONCE // max(len(near), 1), 1)
     for begin in range(0, len(stamps), step):
         # distances and angles first: they leave few to project
-        alike = _seen_alike(points[near], sources[near], centres[begin : begin + step], options)
+        images = states_of_images[begin : begin + step]
+        within = (states_of_near >= images.min() - reach) & (states_of_near <= images.max() + reach)
+        some, states = near[within], states_of_near[within]
+        alike = _seen_alike(points[some], sources[some], centres[begin : begin + step], options)
+        alike &= np.abs(images[:, None] - states) <= reach
         row, which = np.nonzero(alike)
-        row, landmarks = row + begin, near[which]
+        row, landmarks = row + begin, some[which]
         rotation = cam_from_world.rotation[row]
         points_cam = np.einsum("nij,nj->ni", rotation, points[landmarks] - centres[row])
         pixels, valid = model.project(points_cam)
@@ -210,6 +222,16 @@ def _visible(
         found.append((row[valid], landmarks[valid], pixels[valid]))
     image, landmarks, pixels = (np.concatenate(part) for part in zip(*found, strict=True))
     return image, landmarks, pixels
+
+
+def _first_states(problem: RigProblem) -> Indices:
+    """(L,) the state at which each landmark was first seen."""
+    seen, count = problem.observations, len(problem.states)
+    first = np.full(len(problem.landmarks), count)
+    np.minimum.at(
+        first, seen.landmark_indices, np.searchsorted(problem.states.timestamps_ns, seen.timestamps_ns)
+    )
+    return first
 
 
 def _seen_alike(points: Array, sources: Array, centres: Array, options: AssociationOptions) -> Mask:

@@ -23,6 +23,7 @@ from rigwake.ba.solver.schur import LinearObservations
 from rigwake.ba.solver.state_motion import TimedPoses
 
 _CHUNK = 20_000  # landmarks' observations at a time, to bound memory
+_MOST, _SAMPLED = 150_000, 2_000  # observations: of more than these, evenly spread samples of this size do
 _RIDGE = 1e-9
 
 
@@ -36,14 +37,22 @@ def clustered_scatter(
         [-response, np.eye(k), np.zeros((1, k))]
     )  # the last row serves columns that are held
     jacobian, columns = poses.chain(layout)
-    by_frame = np.einsum("fia,fak->fik", jacobian, score[columns])
     observed, predicted = np.zeros((k, k)), np.zeros((k, k))
     starts = observations.landmark_starts
-    for first, last in _chunks(starts):
+    chunks, weight = _chunks(starts), 1.0
+    if starts[-1] > _MOST:
+        # the scatter of some ten thousand landmarks tells enough; all cost as many times the shared parameters squared
+        small = _chunks(starts, _SAMPLED)
+        chunks = small[:: int(np.ceil(starts[-1] / _MOST))]
+        weight = float(starts[-1]) / sum(int(starts[last] - starts[first]) for first, last in chunks)
+    for first, last in chunks:
         rows = slice(starts[first], starts[last])
         if rows.start == rows.stop:
             continue
-        G = observations.by_frame[rows] @ by_frame[observations.frames[rows]]
+        # of the frames at hand alone: for all of them at once it would not fit into memory
+        used, at = np.unique(observations.frames[rows], return_inverse=True)
+        by_frame = np.einsum("fia,fak->fik", jacobian[used], score[columns[used]])
+        G = observations.by_frame[rows] @ by_frame[at]
         if observations.by_extras.shape[2]:
             extras = observations.extras[rows]
             index = np.where(extras >= 0, layout.extras_start + extras, n + k)
@@ -58,12 +67,13 @@ def clustered_scatter(
         block += _RIDGE * np.einsum("laa->l", block)[:, None, None] * np.eye(3) + 1e-300 * np.eye(3)
         taken = np.einsum("lak,laj->kj", cross, np.linalg.solve(block, cross))
         predicted += np.einsum("mik,mij->kj", G, G, optimize=True) - taken
-    return observed, predicted
+    return weight * observed, weight * predicted
 
 
-def _chunks(starts: Indices) -> list[tuple[int, int]]:
-    """Ranges of landmarks with about `_CHUNK` observations each."""
+def _chunks(starts: Indices, size: int | None = None) -> list[tuple[int, int]]:
+    """Ranges of landmarks with about `size` (`_CHUNK`) observations each."""
+    size = _CHUNK if size is None else size
     total, n = int(starts[-1]), len(starts) - 1
-    cuts = np.unique(np.searchsorted(starts, np.arange(0, total + _CHUNK, _CHUNK)).clip(0, n))
+    cuts = np.unique(np.searchsorted(starts, np.arange(0, total + size, size)).clip(0, n))
     cuts = np.unique(np.append(cuts, [0, n]))
     return list(zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True))

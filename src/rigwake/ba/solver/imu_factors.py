@@ -12,16 +12,22 @@ from rigwake._types import Array, Indices
 from rigwake.ba.solver.linear_factors import whitening
 from rigwake.ba.solver.normal import Factors
 from rigwake.ba.solver.parameter_layout import ParameterLayout
-from rigwake.ba.solver.preintegration import Preintegrated, imu_noise, preintegrate
+from rigwake.ba.solver.preintegration import LONGEST_BRIDGE_S, Preintegrated, imu_noise, preintegrate
 from rigwake.ba.solver.rig_problem import RigProblem
 from rigwake.ba.solver.state_motion import state_times_s
 from rigwake.geometry import so3
 
 
 def inertial_factors(problem: RigProblem, layout: ParameterLayout) -> Factors:
-    """One factor of 15 rows `[rotation, velocity, position, gyro bias, accel bias]` per pair of neighbours."""
+    """One factor of 15 rows `[rotation, velocity, position, gyro bias, accel bias]` per pair of neighbours.
+
+    Neighbours further apart than `LONGEST_BRIDGE_S` belong to different sections: the first nine rows are empty.
+    """
     residuals, jacobian, columns, covariance = inertial_rows(problem, layout)
     whiten = whitening(covariance)
+    # from one section to the next only the biases are known to be related
+    apart = np.diff(problem.states.timestamps_ns) > round(LONGEST_BRIDGE_S * 1e9)
+    whiten[apart, :9] = 0.0
     r = np.einsum("nij,nj->ni", whiten, residuals)
     return Factors(r, whiten @ jacobian, columns, 0.5 * float(np.sum(r * r)))
 

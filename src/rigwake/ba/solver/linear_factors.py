@@ -13,6 +13,7 @@ import numpy as np
 from rigwake._types import Array, Indices, Mask
 from rigwake.ba.solver.normal import Factors
 from rigwake.ba.solver.parameter_layout import ParameterLayout
+from rigwake.ba.solver.preintegration import LONGEST_BRIDGE_S
 from rigwake.ba.solver.rig_problem import (
     CameraBaseline,
     CameraDistance,
@@ -60,9 +61,12 @@ def measured_factors(
 
 
 def inside_states(problem: RigProblem, timestamps_ns: Indices) -> Mask:
-    """Which stamps lie between the first and the last state."""
+    """Which stamps lie between the first and the last state, and not between two sections."""
     stamps = problem.states.timestamps_ns
-    return np.asarray((timestamps_ns >= stamps[0]) & (timestamps_ns <= stamps[-1]))
+    inside = (timestamps_ns >= stamps[0]) & (timestamps_ns <= stamps[-1])
+    after = np.minimum(np.searchsorted(stamps, timestamps_ns), len(stamps) - 1)
+    apart = stamps[after] - stamps[np.maximum(after - 1, 0)] > round(LONGEST_BRIDGE_S * 1e9)
+    return np.asarray(inside & ~(apart & (timestamps_ns < stamps[after])))
 
 
 def whitening(covariances: Array) -> Array:

@@ -22,6 +22,8 @@ from rigwake.ba.solver.schur import FrameEquations, FramePairs
 from rigwake.ba.solver.state_motion import TimedPoses
 from rigwake.parallel import over_ranges
 
+_PORTION = 8_000_000  # numbers of a block that is held at a time
+
 
 @dataclass(frozen=True, eq=False)
 class Factors:
@@ -82,15 +84,17 @@ class NormalEquations:
 
     def add_frames(self, equations: FrameEquations, pairs: FramePairs, poses: TimedPoses) -> None:
         """Add reduced frames, whose tangents depend on states and shared parameters as `poses` says."""
-        n = self.layout.n_state_columns
         self._add_states(equations.blocks, pairs, poses)
-        coupling = self._coupling_block(equations.blocks, pairs, poses)
-        coupling[:, :, self.layout.extras_start - n :] += equations.with_extras
         jacobian, columns = poses.chain(self.layout)
-        coupling = np.einsum("fia,fik->fak", jacobian, coupling)
-        is_state, is_shared = (columns >= 0) & (columns < n), columns >= n
-        np.add.at(self.border, columns[is_state], coupling[is_state])
-        np.add.at(self.corner, columns[is_shared] - n, coupling[is_shared])
+        # frames in portions: what couples all of them with all shared parameters would not fit into memory
+        per_frame = 6 * max(self.layout.n_columns - self.layout.n_state_columns, 1)
+        portion = max(_PORTION // per_frame, 1)
+        for begin in range(0, len(columns), portion):
+            rows = slice(begin, min(begin + portion, len(columns)))
+            coupling = self._coupling_block(equations, pairs, poses, rows)
+            _scatter_coupling(
+                coupling, jacobian[rows], columns[rows], self.layout.n_state_columns, self.border, self.corner
+            )
         gradients = np.einsum("fia,fi->fa", jacobian, equations.gradient)
         diagonals = np.einsum("fia,fi,fia->fa", jacobian, equations.diagonal, jacobian)
         self._add_vectors(gradients, diagonals, columns)
@@ -112,19 +116,24 @@ class NormalEquations:
 
         over_ranges(_apart(pairs.bounds, poses.states), work)
 
-    def _coupling_block(self, blocks: Array, pairs: FramePairs, poses: TimedPoses) -> Array:
-        """(F, 6, k) what the shared parameters' steps do to the right-hand side of every frame."""
+    def _coupling_block(
+        self, equations: FrameEquations, pairs: FramePairs, poses: TimedPoses, rows: slice
+    ) -> Array:
+        """(f, k, 6) what the shared parameters' steps do to the right-hand sides of these frames."""
         n = self.layout.n_state_columns
-        coupling = np.zeros((len(poses.states), self.layout.n_columns - n, 6))
+        coupling = np.zeros((rows.stop - rows.start, self.layout.n_columns - n, 6))
 
         def work(first: int, last: int) -> None:
             _scatter_shared(
-                first, last, blocks, pairs.row_starts, pairs.partners, pairs.rows, pairs.column_starts,
-                pairs.columns, poses.shared - n, poses.by_shared, coupling,
+                rows.start, first, last, equations.blocks, pairs.row_starts, pairs.partners, pairs.rows,
+                pairs.column_starts, pairs.columns, poses.shared - n, poses.by_shared, coupling,
             )  # fmt: skip
 
-        over_ranges(pairs.bounds, work)
-        return np.swapaxes(coupling, 1, 2)
+        inner = pairs.bounds[(pairs.bounds > rows.start) & (pairs.bounds < rows.stop)]
+        over_ranges(np.concatenate([[rows.start], inner, [rows.stop]]), work)
+        with_extras = np.swapaxes(equations.with_extras[rows], 1, 2)
+        coupling[:, self.layout.extras_start - n :] += with_extras
+        return coupling
 
     def _add_extras(self, equations: FrameEquations) -> None:
         start = self.layout.extras_start
@@ -260,17 +269,48 @@ def _add_symmetric(product, row, column, w, n, states, tile, first, offsets):  #
 
 
 @njit(cache=True, nogil=True)
+def _scatter_coupling(coupling, jacobian, columns, n, border, corner):  # type: ignore[no-untyped-def]
+    """Add `J_f^T c` of every frame and shared parameter that it has to do with."""
+    for f in range(coupling.shape[0]):
+        for k in range(coupling.shape[1]):
+            c = coupling[f, k]
+            if c[0] == 0 and c[1] == 0 and c[2] == 0 and c[3] == 0 and c[4] == 0 and c[5] == 0:
+                continue
+            for a in range(columns.shape[1]):
+                column, total = columns[f, a], 0.0
+                if column < 0:
+                    continue
+                for i in range(6):
+                    total += jacobian[f, i, a] * c[i]
+                if column < n:
+                    border[column, k] += total
+                else:
+                    corner[column - n, k] += total
+
+
+@njit(cache=True, nogil=True)
 def _scatter_shared(  # type: ignore[no-untyped-def]
-    begin, end, blocks, row_starts, partners, rows, column_starts, columns, shared, by_shared, coupling
+    origin,
+    begin,
+    end,
+    blocks,
+    row_starts,
+    partners,
+    rows,
+    column_starts,
+    columns,
+    shared,
+    by_shared,
+    coupling,
 ):
-    """Add `(S B_g)^T` of every pair with g to `coupling` of f, whichever of the two is later."""
+    """Add `(S B_g)^T` of every pair with g to `coupling` of f - origin, whichever of the two is later."""
     for f in range(begin, end):
         for pair in range(row_starts[f], row_starts[f + 1]):
             g = partners[pair]
-            _add_columns(blocks[pair], by_shared[g], shared[g], coupling[f])
+            _add_columns(blocks[pair], by_shared[g], shared[g], coupling[f - origin])
         for slot in range(column_starts[f], column_starts[f + 1]):
             g = rows[columns[slot]]
-            _add_columns(blocks[columns[slot]].T, by_shared[g], shared[g], coupling[f])
+            _add_columns(blocks[columns[slot]].T, by_shared[g], shared[g], coupling[f - origin])
 
 
 @njit(cache=True, nogil=True)

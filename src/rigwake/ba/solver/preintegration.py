@@ -21,7 +21,8 @@ from rigwake.ba.solver.rig_problem import RigProblem
 from rigwake.errors import UsageError
 from rigwake.recording import ImuStream
 
-_LONGEST_BRIDGE_S = 5.0
+LONGEST_BRIDGE_S = 5.0
+"""Seconds between states over which inertial samples are not integrated any more."""
 _GAP = 2.5  # a step longer than this many median steps is a gap
 
 
@@ -91,7 +92,7 @@ def gap_walks(imu: ImuStream) -> tuple[Array, float]:
     walks = np.array([np.mean(np.diff(signal, axis=0)[regular] ** 2) / usual for signal in signals])
     if regular.all():
         return walks, _GAP * usual
-    length = round(min(float(steps.max()), _LONGEST_BRIDGE_S) / usual)
+    length = round(min(float(steps.max()), LONGEST_BRIDGE_S) / usual)
     seconds = length * usual
     broken = np.concatenate([[0], np.cumsum(~regular)])
     for k, signal in enumerate(signals):

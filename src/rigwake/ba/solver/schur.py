@@ -280,6 +280,9 @@ def _subtract_landmarks(  # type: ignore[no-untyped-def]
                     WV[i, j] = total
                 gradient[f, i] -= WV[i, 0] * g[0] + WV[i, 1] * g[1] + WV[i, 2] * g[2]
                 for q in range(n_extras):
+                    # lenses of cameras that do not see the landmark
+                    if We[q, 0] == 0.0 and We[q, 1] == 0.0 and We[q, 2] == 0.0:
+                        continue
                     with_extras[f, i, q] -= WV[i, 0] * We[q, 0] + WV[i, 1] * We[q, 1] + WV[i, 2] * We[q, 2]
             begin = starts[landmark]
             row = partners[row_starts[f] : row_starts[f + 1]]

@@ -1,0 +1,1 @@
+"""Which parts of a long recording to calibrate from: what each tells of the rig, the smallest set of them."""
