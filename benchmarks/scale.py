@@ -20,7 +20,7 @@ import numpy as np
 
 from rigwake.ba.rig.assemble_problem import assemble_problem
 from rigwake.ba.rig.outlier_rounds import adjust
-from rigwake.ba.rig.rig_values import AdjustmentOptions, InitialValues, RigMeasurements
+from rigwake.ba.rig.rig_values import AdjustmentOptions, InitialRig, RigMeasurements
 from rigwake.ba.solver.covariance import covariance_of
 from rigwake.ba.solver.rig_problem import BundleCamera
 from rigwake.config import load_config
@@ -72,7 +72,7 @@ def recording_of(simulated: Simulation) -> Recording:
     return build_recording(simulated, {c.name: NoFrames() for c in simulated.scenario.cameras}, Path("scale"))
 
 
-def first_values(recording: Recording, turn_deg: float, shift_m: float) -> InitialValues:
+def first_values(recording: Recording, turn_deg: float, shift_m: float) -> InitialRig:
     """The truth in the IMU's frame, with mountings off at random."""
     rng = np.random.default_rng(0)
     assert recording.true_rig is not None
@@ -86,7 +86,7 @@ def first_values(recording: Recording, turn_deg: float, shift_m: float) -> Initi
             name, stream.model, mounted, free=frozenset({"rig_from_cam", "time_offset"})
         )
     path = Trajectory("imu", body.timestamps_ns, body.world_from_body * recording.true_rig.rig_from_imu)
-    return InitialValues(path, cameras, antenna_rig=truth.antenna_rig)
+    return InitialRig(path, cameras, antenna_rig=truth.antenna_rig)
 
 
 def told_by_tracks(

@@ -146,8 +146,8 @@ def started_from(
     for name, camera in cameras.items():
         former = mended.selection.cameras[name].model
         if former is not None:
-            doubted = _contradicts(former, camera.lens, camera.tracks.pixels)
-            beliefs[name] = LensBelief(former, DISBELIEVED if doubted else FROM_A_FILE)
+            contradicted = _contradicts(former, camera.lens, camera.tracks.pixels)
+            beliefs[name] = LensBelief(former, DISBELIEVED if contradicted else FROM_A_FILE)
     found = _with_cameras(mended, cameras, frozenset(cameras))
     models = {n: m for n in found.trajectories if (m := found.selection.cameras[n].model) is not None}
     fits = fit_lenses(found.tracks, models, found.trajectories)

@@ -36,9 +36,7 @@ _TONES = {"enough": "good", "partly": "usable", "not enough": "lost"}
 _PASSED = {True: "yes", False: "no", None: "cannot tell"}
 
 
-def inspection_page(
-    inspection: Inspection, readiness: Readiness, told: ToldOverTime | None = None
-) -> str:
+def inspection_page(inspection: Inspection, readiness: Readiness, told: ToldOverTime | None = None) -> str:
     """The page; it loads nothing from elsewhere. Pictures that cannot be read are left out."""
     recording = inspection.recording
     checks = [[check.name, check.measured, _PASSED[check.passed]] for check in readiness.checks]
@@ -183,7 +181,9 @@ def _information_card(inspection: Inspection, told: ToldOverTime | None) -> Mark
         middle = edges.mean(axis=1)[told.chosen]
         series.append(Series("", middle, percent[told.chosen], 1, is_dots=True))
     title = "Information about the rig over time"
-    words = f"What each stretch tells, in percent of the whole; dots: stretches that would be used. {told.words}"
+    words = (
+        f"What each stretch tells, in percent of the whole; dots: stretches that would be used. {told.words}"
+    )
     return card(title, figure(line_chart(title, "time, s", "% of all", series), words))
 
 
