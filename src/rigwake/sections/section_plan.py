@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from rigwake._progress import CountProgress
 from rigwake._types import Array, Image, Indices
 from rigwake.ba.rig.rig_values import AdjustmentOptions
 from rigwake.errors import UnobservableError
@@ -27,8 +28,6 @@ DEFAULT_BUDGET_S = 300.0
 _CORNERS = 60  # in a small picture: as many as are worth following
 _SMALL_PX = 320
 _BORDER_NS = 1_000_000  # spans end just before the next begins
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ def plan_sections(
     gnss: GnssStream | None,
     wish: SectionWish,
     adjustment: AdjustmentOptions,
-    progress: Progress = lambda words, done, total: None,
+    progress: CountProgress = lambda words, done, total: None,
 ) -> SectionPlan | None:
     """Predict what each stretch tells, and choose. None where neither an IMU nor a receiver tells how the rig moved.
 
@@ -128,7 +127,7 @@ def plan_sections(
 def texture_over_time(
     cameras: Mapping[str, CameraStream],
     spans_ns: Indices,
-    progress: Progress = lambda words, done, total: None,
+    progress: CountProgress = lambda words, done, total: None,
 ) -> Array:
     """(S, C) how much a picture in the middle of each stretch shows to follow, 0 to 1; 1 where no picture can be read
     anywhere, and 0 in stretches without frames."""

@@ -226,10 +226,12 @@ def _visible(
 
 def _first_states(problem: RigProblem) -> Indices:
     """(L,) the state at which each landmark was first seen."""
-    seen, count = problem.observations, len(problem.states)
+    observations, count = problem.observations, len(problem.states)
     first = np.full(len(problem.landmarks), count)
     np.minimum.at(
-        first, seen.landmark_indices, np.searchsorted(problem.states.timestamps_ns, seen.timestamps_ns)
+        first,
+        observations.landmark_indices,
+        np.searchsorted(problem.states.timestamps_ns, observations.timestamps_ns),
     )
     return first
 
