@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from rigwake._progress import CountProgress
 from rigwake.config import CalibrateConfig
 from rigwake.errors import RigwakeError, UnobservableError
 from rigwake.pipeline.stream_selection import Selection, select
 from rigwake.recording import Recording
 from rigwake.sections.section_plan import (
     USE_ALL_BELOW_S,
-    Progress,
     SectionPlan,
     SectionWish,
     cut_to_sections,
@@ -30,7 +30,7 @@ def section_wish(config: CalibrateConfig) -> SectionWish:
 
 
 def with_chosen_sections(
-    selection: Selection, config: CalibrateConfig, progress: Progress
+    selection: Selection, config: CalibrateConfig, progress: CountProgress
 ) -> tuple[Selection, SectionPlan | None]:
     """The selection cut to the sections worth using, and the plan; unchanged, and None, where all is used anyway.
 
@@ -62,7 +62,7 @@ def with_chosen_sections(
 
 
 def planned_sections(
-    recording: Recording, config: CalibrateConfig, progress: Progress = lambda words, done, total: None
+    recording: Recording, config: CalibrateConfig, progress: CountProgress = lambda words, done, total: None
 ) -> SectionPlan | str:
     """What `calibrate` would use of a recording with these settings, and what that predicts; or why nobody can tell."""
     try:
@@ -71,7 +71,7 @@ def planned_sections(
         return error.cause
 
 
-def _plan(selection: Selection, config: CalibrateConfig, progress: Progress) -> SectionPlan | str:
+def _plan(selection: Selection, config: CalibrateConfig, progress: CountProgress) -> SectionPlan | str:
     """The plan, or why there is none; then all is used."""
     try:
         plan = plan_sections(
