@@ -95,7 +95,7 @@ def test_tracks_are_bounded_in_all() -> None:
                 measurements(world), first_values(world), AdjustmentOptions(most_tracks=most)
             ).problem.landmarks
         )
-        for most in (120_000, 300)
+        for most in (80_000, 300)
     ]
     assert counts[1] <= 300 < counts[0]
     with pytest.raises(UsageError, match="most_tracks"):

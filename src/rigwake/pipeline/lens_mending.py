@@ -43,6 +43,7 @@ DISBELIEVED = IntrinsicsWidth(focal=0.02, centre_px=10.0, distortion=0.1, aspect
 _ROUNDS = 3
 _FARTHEST_SCALE, _FARTHEST_SHIFT = 0.1, 0.08  # a lens further off (centre: of the width) is another camera's
 _AGAIN_PX = 2.0  # RMS: what was made with a lens so far off is made again
+_AGAIN_MOVED_PX = 0.2  # so is what was made with one that was only guessed
 _UNLIKELY = 1e-3
 _SURE_SCALE = 0.004  # deviation
 _HELD_SCALE = 1e-5
@@ -136,7 +137,8 @@ def started_from(
     cameras = {}
     for name, lens in lenses.items():
         former, own = mended.selection.cameras[name].model, mended.tracks[name]
-        if former is not None and _rms_px(former, lens, own.pixels) > _AGAIN_PX:
+        limit = _AGAIN_MOVED_PX if name in mended.moved else _AGAIN_PX
+        if former is not None and _rms_px(former, lens, own.pixels) > limit:
             again = _seen_by(lens, own, mended.trajectories[name], odometry)
             if again is not None:
                 cameras[name] = again

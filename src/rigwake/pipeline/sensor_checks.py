@@ -69,18 +69,20 @@ def vet_sensors(
     *,
     without_horizon: frozenset[str] = frozenset(),
     lenses: Mapping[str, LensFit] | None = None,
+    pardoned: frozenset[str] = frozenset(),
     repair: bool,
 ) -> VettedSensors:
     """Lenses, gyroscope, clocks, mounts, accelerometer and GNSS from what every camera saw by itself.
 
     tracks, trajectories: by camera. without_horizon: cameras that show nothing above the horizon that the IMU tells;
-    they never take part. lenses: their fits, where they are known already. Cameras that disagree are left out while
-    others remain; so is GNSS if there is an IMU. Raises InputError that names what is wrong where nothing can be left
-    out.
+    they never take part. lenses: their fits, where they are known already. pardoned: cameras of which nothing is said,
+    as long as their lens is not known. Cameras that disagree are left out while others remain; so is GNSS if there is
+    an IMU. Raises InputError that names what is wrong where nothing can be left out.
     """
     models = {name: m for name in trajectories if (m := selection.cameras[name].model) is not None}
     found = compare_sensors(selection.imu, tracks, models, trajectories, lenses=lenses, repair=repair)
-    checks, imu = list(found.checks), found.imu
+    spared = {f"camera {name}" for name in pardoned}
+    checks, imu = [check for check in found.checks if check.sensor not in spared], found.imu
     accused = {check.sensor for check in disagreeing(checks)}
     checks += [_without_horizon(n) for n in sorted(without_horizon) if f"camera {n}" not in accused]
     refuse([check for check in checks if not check.sensor.startswith("camera ")])

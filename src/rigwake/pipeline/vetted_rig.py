@@ -62,11 +62,12 @@ def estimate_vetted_rig(
         mended = mend_lenses(selection, tracks, trajectories, odometry) if refines else mended
     # landmarks are not looked for in other cameras before the lenses are known
     alone = _without_association(config) if mended.moved else config
-    found = _one_pass(recording, mended, alone, prior, masks, without_horizon, progress)
+    found = _one_pass(recording, mended, alone, prior, masks, without_horizon, mended.moved, progress)
     if refines:
         again = started_from(mended, found.rig.lenses, odometry)
         if mended.moved or again is not mended:
-            found = _one_pass(recording, again, config, prior, masks, without_horizon, progress)
+            nobody: frozenset[str] = frozenset()
+            found = _one_pass(recording, again, config, prior, masks, without_horizon, nobody, progress)
         refuse_contradicted(again, found.rig.lenses)
     return found
 
@@ -83,6 +84,7 @@ def _one_pass(
     prior: RigPrior,
     masks: Path,
     without_horizon: frozenset[str],
+    pardoned: frozenset[str],
     progress: Callable[[str, float], None],
 ) -> VettedRig:
     vetted = VettedSensors(mended.selection)
@@ -94,6 +96,7 @@ def _one_pass(
             mended.trajectories,
             without_horizon=without_horizon,
             lenses=mended.fits,
+            pardoned=pardoned,
             repair=config.repair,
         )
     selection = vetted.selection

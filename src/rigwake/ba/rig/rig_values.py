@@ -32,7 +32,7 @@ class AdjustmentOptions:
     state_rate_hz: float = 3.0
     state_rate_without_imu_hz: float = 10.0
     tracks_per_second: int = 60
-    most_tracks: int = 120_000
+    most_tracks: int = 80_000
     min_observations: int = 3
     gate_stds: float = 4.0
     rounds: int = 2
