@@ -161,7 +161,7 @@ def test_tables_fit_a_terminal_of_80_columns(
     assert "…" not in "".join(shown)
     rows = [line.split() for line in shown if line.startswith(("port", "front", "aft"))]
     assert {row[0] for row in rows} == {"front", "port", "aft"}
-    assert len(rows) == 4 * 3  # evaluate, two tables of diff, calibrate: one line per camera each
+    assert len(rows) == 5 * 3  # evaluate, two tables of diff, two of calibrate: one line per camera each
     assert "undetermined" in "".join(shown)
     assert "nan" not in "".join(shown)
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from rigwake.handeye.handeye_result import HandeyeOptions
 
 from board_simulation import looking_poses, simulated_corners
 from calibrated_rigs import boat
@@ -21,6 +20,7 @@ from rigwake.evaluation.trajectory_evaluation import evaluate_trajectory
 from rigwake.fleet.fleet_jobs import FleetOutcome
 from rigwake.fleet.fleet_page import render_page as fleet_page
 from rigwake.geometry.se3 import SE3
+from rigwake.handeye.handeye_problem import HandeyeOptions
 from rigwake.inspection.readiness import judge
 from rigwake.inspection.recording_inspection import inspect_recording
 from rigwake.intrinsics.boards import parse_board

@@ -14,8 +14,7 @@ from rigwake.errors import EstimationError
 from rigwake.geometry import so3
 from rigwake.geometry.align import align_points
 from rigwake.geometry.interpolate import interpolate
-from rigwake.handeye.handeye_problem import HandeyeResult
-from rigwake.handeye.one_body import in_one_unit
+from rigwake.handeye.handeye_problem import HandeyeResult, in_one_unit
 from rigwake.plausibility.values import SensorCheck
 from rigwake.report.charts import Series, line_chart, top_view
 from rigwake.report.extrinsics import number, plus_minus, time_offset
