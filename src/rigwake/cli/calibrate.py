@@ -57,7 +57,7 @@ def command(
         typer.Option(help="Use as much as every camera needs for these sigmas: 5mm, 0.02deg or 5mm,0.02deg."),
     ] = None,
     budget: Annotated[
-        float | None, typer.Option(help="CPU-seconds it may take (default of recordings over 60 s: 300).")
+        float | None, typer.Option(help="CPU-seconds it may take (default of recordings over 2 min: 300).")
     ] = None,
     use_all: Annotated[bool, typer.Option("--all", help="Use all of a long recording.")] = False,
     prior: Annotated[

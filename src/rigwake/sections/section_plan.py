@@ -23,7 +23,7 @@ from rigwake.sections.section_choice import Precision, SectionChoice, choose_sec
 from rigwake.sections.stretch_information import StretchInformation, stretch_information, stretch_spans
 
 STRETCH_S = 8.0
-USE_ALL_BELOW_S = 60.0
+USE_ALL_BELOW_S = 121.0  # two minutes, the length that is asked for elsewhere
 DEFAULT_BUDGET_S = 300.0
 _CORNERS = 60  # in a small picture: as many as are worth following
 _SMALL_PX = 320
