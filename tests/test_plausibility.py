@@ -10,6 +10,7 @@ from calibration_worlds import STILL_WATER, sail
 from rigwake.errors import InputError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
+from rigwake.plausibility import receiver_checks
 from rigwake.plausibility.force_checks import check_forces, compare_forces
 from rigwake.plausibility.force_fit import ForceEquations
 from rigwake.plausibility.imu_samples import vet_samples, vet_turns
@@ -17,7 +18,7 @@ from rigwake.plausibility.lens_checks import check_lenses, fit_lenses
 from rigwake.plausibility.noise_bounds import check_imu_noise
 from rigwake.plausibility.picture_checks import check_pictures
 from rigwake.plausibility.receiver_checks import vet_receiver
-from rigwake.plausibility.receiver_fit import level_path
+from rigwake.plausibility.receiver_fit import ReceiverFit, fit_receiver, level_path
 from rigwake.plausibility.turn_checks import check_clocks, check_mounts, check_scale
 from rigwake.plausibility.turn_fit import TurnFit, camera_as_gyroscope, fit_turns
 from rigwake.plausibility.values import SensorCheck, checks_from_list, checks_to_list, disagreeing, refuse
@@ -253,6 +254,21 @@ def test_exchanged_coordinates_are_named() -> None:
 def test_the_delay_of_a_receiver_is_measured(late_s: float) -> None:
     found = vetted(replace(gnss(), timestamps_ns=gnss().timestamps_ns + round(late_s * 1e9)))
     assert found.delay_s == pytest.approx(late_s, abs=0.02)
+
+
+@pytest.mark.parametrize(("lag_s", "std_s"), [(2.0, 0.4), (3.0, 0.01)])
+def test_a_delay_that_nobody_knows_is_not_told(
+    monkeypatch: pytest.MonkeyPatch, lag_s: float, std_s: float
+) -> None:
+    """A path that drifts, as a camera's without an IMU, fits almost any delay; the longest looked for is none."""
+
+    def lagging(*args: object, **kwargs: object) -> ReceiverFit:
+        return replace(fit_receiver(*args, **kwargs), lag_s=lag_s, lag_std_s=std_s)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(receiver_checks, "fit_receiver", lagging)
+    found = vetted(gnss())
+    assert found.delay_s == 0.0
+    assert not any("late" in check.hypothesis for check in found.checks)
 
 
 def test_fixes_that_stand_still_jump_or_lie_far_off_are_left_out() -> None:

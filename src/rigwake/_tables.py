@@ -19,6 +19,8 @@ def take_rows(table: Table, index: Any, *, keep: Collection[str] = ()) -> Table:
 
 def join_rows(tables: Sequence[Table], *, keep: Collection[str] = ()) -> Table:
     """The rows of all tables, one after the other; fields named in `keep` are those of the first table."""
+    if not tables:
+        raise ValueError("There are no tables to join.")
     first = tables[0]
     joined = {
         name: join_rows([getattr(table, name) for table in tables])

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from rigwake._robust import robust_std
 from rigwake._types import Array
 from rigwake.errors import UnobservableError
-from rigwake.plausibility.receiver_fit import ReceiverFit, axis_confusions, fit_receiver, frozen_rows
+from rigwake.plausibility.receiver_fit import (
+    MAX_LAG_S,
+    ReceiverFit,
+    axis_confusions,
+    fit_receiver,
+    frozen_rows,
+)
 from rigwake.plausibility.values import SensorCheck
 from rigwake.recording import GnssStream
 from rigwake.trajectory import Trajectory
@@ -19,7 +25,7 @@ _DRIFT = 0.01  # of the path: what a camera's own path may be off
 _DRIFT_WITHOUT_IMU = 0.12  # the same of vision alone, whose scale and heading wander
 _STDS = 4.0
 _CLEARLY_BETTER = 0.35
-_DELAY_S, _DELAY_SIGMAS = 0.05, 4.0
+_DELAY_S, _DELAY_SIGMAS, _DELAY_KNOWN_S = 0.05, 4.0, 0.15
 _OUTLIER_STDS = 8.0
 _LEAST_JUMP_M, _JUMP_STDS = 0.5, 8.0
 _FEWEST = 12
@@ -88,7 +94,9 @@ def vet_receiver(
         return VettedReceiver(None, 0.0, fit, (*checks, check))
     gnss, found = _without_outliers(gnss, fit, repair)
     checks += found
-    late = abs(fit.lag_s) > max(_DELAY_S, _DELAY_SIGMAS * fit.lag_std_s)
+    # a path that drifts without an IMU fits almost any delay: that is no knowledge of one
+    known = fit.lag_std_s < _DELAY_KNOWN_S and abs(fit.lag_s) < MAX_LAG_S
+    late = known and abs(fit.lag_s) > max(_DELAY_S, _DELAY_SIGMAS * fit.lag_std_s)
     words = (
         f"its fixes are {1e3 * fit.lag_s:+.0f} ± {1e3 * fit.lag_std_s:.0f} ms late; estimated with the rig."
         if late

@@ -22,7 +22,7 @@ from rigwake.trajectory import Trajectory
 
 _FEWEST = 8
 _LEVER_STD = 8.0
-_MAX_LAG_S = 3.0
+MAX_LAG_S = 3.0
 _MAX_GAP_S = 1.0
 
 
@@ -114,7 +114,7 @@ def fit_receiver(
         step = -np.linalg.lstsq(H, gradient, rcond=1e-14)[0]
         step[[0, 1, 8]] = np.clip(step[[0, 1, 8]], -0.5, 0.5)
         x = x + step
-        x[8] = float(np.clip(x[8], -_MAX_LAG_S, _MAX_LAG_S))
+        x[8] = float(np.clip(x[8], -MAX_LAG_S, MAX_LAG_S))
         if done > 6 and np.abs(step).max() < 1e-5:
             break
     scale = float(np.exp(x[1]))

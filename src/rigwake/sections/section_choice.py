@@ -137,9 +137,7 @@ def choose_sections(
     everything = list(range(len(information)))
     whole = whitened.sigmas(everything)
     if use_all or len(everything) <= _FEWEST_TOGETHER:
-        return _chosen(
-            information, everything, whole, whole, "all of it, as asked" if use_all else "it is short"
-        )
+        return _chosen(information, everything, whole, whole, use_all or "it is short")
     enough, why_enough = _goal(whole, precision)
     afford = np.inf if budget is None else budget
     pick = _window if in_one_piece else _greedy
