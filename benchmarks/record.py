@@ -60,9 +60,12 @@ def machine() -> dict[str, Any]:
 
 def without_paths(text: str) -> str:
     """Text without the folders of this machine."""
-    for folder, word in ((ROOT, "."), (Path.home(), "~")):
-        text = text.replace(str(folder), word)
-    return re.sub(r"/tmp/[\w.-]+", "/tmp/...", text)
+    for folder, word in ((ROOT, "."), (ROOT.parent, ".."), (Path.home(), "~")):
+        if folder != Path("/"):
+            text = text.replace(str(folder), word)
+    text = re.sub(r"/tmp/[\w.-]+", "/tmp/...", text)
+    # what else is absolute: its last part says enough
+    return re.sub(r"(?<![\w./:~])/(?!tmp/)(?:[\w.-]+/)+(?=[\w.-])", ".../", text)
 
 
 def run(name: str, arguments: list[str]) -> dict[str, Any]:

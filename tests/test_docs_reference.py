@@ -56,4 +56,9 @@ def test_pages_of_measurements_are_those_that_the_results_make() -> None:
 def test_a_result_names_no_machine_and_keeps_every_line(tmp_path: Path) -> None:
     recorder = runpy.run_path(str(ROOT / "benchmarks" / "record.py"))
     assert recorder["without_paths"](f"{ROOT}/src and /tmp/abc-1/x") == "./src and /tmp/.../x"
+    assert (
+        recorder["without_paths"]("/srv/rec/harbour 2/3 https://a.b/c ./x")
+        == ".../harbour 2/3 https://a.b/c ./x"
+    )
+    assert recorder["without_paths"](f"{ROOT.parent}/shared") == "../shared"
     assert set(recorder["machine"]()) == {"cpu", "cores", "system", "python", "libraries", "load_before"}
