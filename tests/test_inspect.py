@@ -285,3 +285,12 @@ def test_the_command_prints_json_and_refuses_what_is_no_recording(
     refused = runner.invoke(build_app(), ["inspect", str(tmp_path)])
     assert refused.exit_code != 0
     assert "is not a recording" in str(refused.exception)
+
+
+def test_without_cameras_nothing_is_said_of_them() -> None:
+    recording = Recording(Path("imu alone"), "folder", imus={"imu": simulated_imu(20.0)})
+    checks = {c.name: c for c in judge(inspect_recording(recording)).checks}
+    assert checks["cameras"].passed is False
+    for name in ("intrinsics", "frame rate and length", "common time", "pictures"):
+        assert checks[name].passed is None, name
+        assert "no cameras" in checks[name].measured

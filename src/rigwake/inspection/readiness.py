@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from rigwake.inspection.recording_inspection import Inspection
@@ -22,6 +22,7 @@ MAX_STILL = 0.7
 MIN_CAMERA_HZ = 3.0
 MIN_SECONDS = 15.0  # as `calibrate` demands
 _MOST_OF_IT = 0.8  # of a camera whose sail is short
+_ABOUT_CAMERAS = ("intrinsics", "frame rate and length", "common time", "pictures")
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ def _sensor_checks(inspection: Inspection) -> list[Check]:
     ]
     broken = list(dict.fromkeys(broken))
     metric = bool(recording.gnss or recording.imus) or any(t.is_metric for t in recording.poses.values())
-    return [
+    checks = [
         Check(
             "cameras",
             len(cameras) >= 2 or (len(cameras) == 1 and bool(others)),
@@ -119,6 +120,14 @@ def _sensor_checks(inspection: Inspection) -> list[Check]:
             "an IMU, GNSS or metric poses" if metric else "no sensor that measures metres",
             "Record GNSS or an IMU: without, all offsets are known up to one common scale.",
         ),
+    ]
+    if cameras:
+        return checks
+    return [
+        replace(check, passed=None, measured="there are no cameras", remedy="")
+        if check.name in _ABOUT_CAMERAS
+        else check
+        for check in checks
     ]
 
 
