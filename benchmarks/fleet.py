@@ -226,9 +226,10 @@ print(counts_in_words(result.counts, result.causes), "| done before the restart:
 
 
 def losses(out: str) -> None:
-    """Three real workers; one is killed with -9, later the client is as well, and started again."""
+    """Three real workers, 198 rigs from simulated tracks, one recording that dies and one that hangs; a worker is
+    killed with -9, later the client is as well, and started again."""
     folder = Path(out)
-    written_jobs(folder, ["die", "hang", *(f"slow{k}" for k in range(198))])
+    written_jobs(folder, ["die", "hang", *(f"rig{k}" for k in range(198))])
     noted = folder / "out" / "begun.txt"
 
     def wait_for(count: int) -> None:

@@ -311,6 +311,7 @@ def test_every_option_of_every_verb_is_used() -> None:
 def parameters() -> list:
     """The table, with what takes seconds among the slow tests."""
     costly = ("--model kb4", "--rrd", "--view", "--figures", "--camera all", "--front-end orb")
+    costly += ("--scheduler tcp",)  # each waits for somebody to answer
     return [
         pytest.param(
             *row, id=row[0][:60], marks=[pytest.mark.slow] if any(c in row[0] for c in costly) else []

@@ -50,6 +50,7 @@ def broken() -> tuple[CameraStream, Tracks, np.ndarray, OdometryResult]:
     return stream, tracks, names, estimate_monocular(tracks, fisheye())
 
 
+@pytest.mark.slow
 def test_an_outage_is_bridged_by_recognising_the_place(broken):
     stream, tracks, names, before = broken
     camera = fisheye()
@@ -64,6 +65,7 @@ def test_an_outage_is_bridged_by_recognising_the_place(broken):
     assert after.counts.placed == before.counts.placed
 
 
+@pytest.mark.slow
 def test_a_loop_joins_segments_of_different_units_and_takes_their_drift_away():
     path = circling(160, seconds_per_turn=13.0)  # a turn and a quarter; tracks live for a second and a half
     tracks = tracks_of(path, fisheye(), points=200, longest=15, noise_px=0.5)

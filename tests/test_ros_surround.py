@@ -69,6 +69,7 @@ def wait_for(condition: Callable[[], bool], seconds: float = 30.0) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_it_is_the_panorama_that_surround_draws(sail: tuple[Path, Path]) -> None:
     bag, calibration = sail
     painter = SurroundPainter(calibration)

@@ -66,6 +66,7 @@ def cheapest_by_trying_all(cost: np.ndarray, horizon: int) -> float:
     return best
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_the_cut_is_the_cheapest_of_all(seed: int) -> None:
     rng = np.random.default_rng(seed)
