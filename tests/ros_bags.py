@@ -14,6 +14,7 @@ from rosbags.rosbag2 import CompressionFormat, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 from rigwake.readers.ros_decoding import typestore
+from rigwake.recording import Recording
 
 START_NS = 1_700_000_000_000_000_000
 WIDTH, HEIGHT = 16, 12
@@ -179,3 +180,17 @@ class SmallBag:
         stamped = self.make("geometry_msgs/msg/TransformStamped", self.header(at_s, edge[0]), edge[1], inner)
         kind = "tf2_msgs/msg/TFMessage"
         self.write(topic, kind, self.make(kind, [stamped]), at_s, publisher=publisher)
+
+
+def assert_same_recording(recorded: Recording, played: Recording) -> None:
+    """The same cameras, stamps, lenses and pictures, the same IMU, the same transforms."""
+    assert set(recorded.cameras) == set(played.cameras)
+    for name, camera in played.cameras.items():
+        again = recorded.cameras[name]
+        np.testing.assert_array_equal(again.timestamps_ns, camera.timestamps_ns)
+        assert again.model == camera.model
+        for ours, theirs in zip(again.frames(), camera.frames(), strict=True):
+            np.testing.assert_array_equal(ours.image, theirs.image)
+    (imu,), (true,) = recorded.imus.values(), played.imus.values()
+    np.testing.assert_array_equal(imu.gyro, true.gyro)
+    assert recorded.static_transforms.keys() == played.static_transforms.keys()

@@ -168,6 +168,13 @@ def test_damaged_files_are_named(tmp_path: Path, content: object, message: str) 
         load_calibration(path)
 
 
+def test_the_folder_that_holds_it_is_read_as_well(tmp_path: Path) -> None:
+    save_calibration(calibration_from_dict(good()), tmp_path / "calibration.yaml")
+    assert load_calibration(tmp_path).reference == load_calibration(tmp_path / "calibration.yaml").reference
+    with pytest.raises(InputError, match="regular file"):
+        load_calibration(tmp_path.parent)
+
+
 def test_missing_and_unreadable_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no file"):
         load_calibration(tmp_path / "nothing.yaml")

@@ -142,19 +142,22 @@ def test_another_deck_cannot_be_compared_and_none_says_nothing() -> None:
 def test_what_is_kept_is_read_back(tmp_path: Path) -> None:
     stream = camera()
     assert load_hull_picture(tmp_path, "front") is None
-    CameraMask(WIDTH, HEIGHT).with_region("hull", DECK).save(tmp_path, "front")
-    save_hull_picture(stream, tmp_path)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    CameraMask(WIDTH, HEIGHT).with_region("hull", DECK).save(masks, "front")
+    save_hull_picture(stream, masks)
     kept = load_hull_pictures(tmp_path, ["front", "left"])
     assert list(kept) == ["front"]
+    assert list(load_hull_pictures(tmp_path / "calibration.yaml", ["front", "left"])) == ["front"]
     assert np.abs(kept["front"].picture[DECK] - kept_picture().picture[DECK]).max() < 8
     np.testing.assert_array_equal(kept["front"].region, DECK)
     assert not cue_of(stream, kept["front"]).moved
-    (tmp_path / "front_mean.png").write_bytes(b"not a picture")
+    (masks / "front_mean.png").write_bytes(b"not a picture")
     with pytest.raises(InputError, match="not a grey picture"):
-        load_hull_picture(tmp_path, "front")
-    cv2.imwrite(str(tmp_path / "front_mean.png"), np.zeros((4, 4), np.uint16))
+        load_hull_picture(masks, "front")
+    cv2.imwrite(str(masks / "front_mean.png"), np.zeros((4, 4), np.uint16))
     with pytest.raises(InputError, match="do not belong together"):
-        load_hull_picture(tmp_path, "front")
+        load_hull_picture(masks, "front")
 
 
 def test_what_the_hull_adds_to_the_verdict() -> None:

@@ -144,7 +144,6 @@ def odometry(
     """
     from rigwake.odometry.camera_odometry import CameraOdometryOptions
     from rigwake.pipeline.odometry_run import run_odometry
-    from rigwake.plausibility.values import refuse
 
     run = run_odometry(
         opened(recording),
@@ -160,8 +159,7 @@ def odometry(
     )
     if not run.done:
         raise next(iter(run.missing.values()))
-    lenses = [c for c in run.checks if not c.agrees and "lens" in c.hypothesis]
-    refuse([c for c in run.checks if c not in lenses], "What was written is not to be trusted.")
+    run.refuse_contradicted()
     return run
 
 
@@ -322,7 +320,7 @@ def monitor(
 
     calibrated, watched = calibration_of(calibration), opened(recording)
     file = Path(calibration) if isinstance(calibration, str | Path) else None
-    hull = {} if file is None else load_hull_pictures(file.parent / "masks", calibrated.cameras)
+    hull = {} if file is None else load_hull_pictures(file, calibrated.cameras)
     result = run(calibrated, watched, progress, hull=hull)
     note = "" if file is None else file.name
     keep_result(

@@ -252,5 +252,8 @@ def calibration_from_dict(content: Any, where: str = "calibration") -> Calibrati
 
 
 def load_calibration(path: Path | str) -> Calibration:
-    """Read a calibration file; raises InputError that names what is missing or wrong."""
+    """Read a calibration file, or that of the folder that `calibrate` leaves; raises InputError that names what is
+    missing or wrong."""
+    kept = Path(path) / "calibration.yaml"
+    path = kept if kept.is_file() else path
     return calibration_from_dict(read_yaml(path), str(path))

@@ -66,7 +66,7 @@ def command(
             pass  # what is wrong with it is told before the work
     opened = open_recording(recording, TopicMap.from_options(topic or (), topics, camera_file or ()))
     with progress_bars() as bars:
-        hull = load_hull_pictures(calibration.parent / "masks", calibrated.cameras)
+        hull = load_hull_pictures(calibration, calibrated.cameras)
         result = monitor(calibrated, opened, bars, hull=hull)
     if json_file is not None:
         write_json(json_file, result_to_dict(result))

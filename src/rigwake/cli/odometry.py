@@ -117,7 +117,7 @@ def command(
     from rigwake.odometry.odometry_options import OdometryOptions
     from rigwake.odometry.thesis_odometry import ThesisOptions
     from rigwake.pipeline.odometry_run import odometry_summary, run_odometry
-    from rigwake.plausibility.values import checks_to_list, refuse
+    from rigwake.plausibility.values import checks_to_list
     from rigwake.readers.open import open_recording
     from rigwake.readers.topics import TopicMap
     from rigwake.tracking.tracking_options import FrontEndName, TrackingOptions
@@ -161,10 +161,9 @@ def command(
         raise next(iter(run.missing.values()))
     if not quiet:
         _name_next_step(recording, run.done, output, topic_words(topic, topics))
-    lenses = [c for c in run.checks if not c.agrees and "lens" in c.hypothesis]
-    for check in lenses:
+    for check in run.lens_checks:
         err.print(f"[yellow]{escape(check.sentence)}[/yellow]", soft_wrap=True)
-    refuse([c for c in run.checks if c not in lenses], "What was written is not to be trusted.")
+    run.refuse_contradicted()
     if run.missing and not allow_partial:
         raise PartialResultError(
             f"{len(run.missing)} of {len(run.results)} cameras {'has' if len(run.missing) == 1 else 'have'} "

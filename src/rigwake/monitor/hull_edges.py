@@ -63,6 +63,11 @@ class HullCue:
     since_ns: int | None
     words: str
 
+    @classmethod
+    def untold(cls, camera: str, words: str, steps: tuple[HullStep, ...] = ()) -> HullCue:
+        """Nothing that can be told of a camera, and why."""
+        return cls(camera, steps, None, None, None, words)
+
     @property
     def moved(self) -> bool:
         """Whether the hull is elsewhere in the picture."""
@@ -87,11 +92,11 @@ def hull_cues(
             continue
         on_rig = stream.timestamps_ns + round(time_offsets_s[name] * 1e9)
         if kept.picture.shape != (stream.height_px, stream.width_px):
-            cues[name] = HullCue(name, (), None, None, None, "the picture kept of it has another size")
+            cues[name] = HullCue.untold(name, "the picture kept of it has another size")
             continue
         reference = HullEdges(kept, stream.model)
         if not reference.is_enough:
-            cues[name] = HullCue(name, (), None, None, None, "too little of the own hull is in view")
+            cues[name] = HullCue.untold(name, "too little of the own hull is in view")
             continue
         steps = []
         for start in starts_ns:
@@ -207,7 +212,7 @@ def judge_hull(camera: str, steps: list[HullStep], thresholds: Thresholds, origi
     usable = [step for step in steps if step.likeness >= _LEAST_LIKENESS and step.covariance.any()]
     if not usable:
         why = "no picture" if not steps else "it looks different: other light, or things on deck"
-        return HullCue(camera, (), None, None, None, f"cannot be compared: {why}")
+        return HullCue.untold(camera, f"cannot be compared: {why}")
     covariances = _widened(usable)
     floor = np.deg2rad(_FLOOR_DEG) ** 2 * np.eye(3)
     statistic = np.array(
@@ -221,9 +226,7 @@ def judge_hull(camera: str, steps: list[HullStep], thresholds: Thresholds, origi
     first = int(twice[0]) if len(twice) else 0
     chosen = np.arange(len(usable)) >= first if len(twice) else ~beyond
     if not chosen.any():
-        return HullCue(
-            camera, tuple(usable), None, None, None, "own hull elsewhere, but for five seconds only"
-        )
+        return HullCue.untold(camera, "own hull elsewhere, but for five seconds only", tuple(usable))
     rotation, covariance = _mean(
         [s for s, used in zip(usable, chosen, strict=True) if used],
         [c for c, used in zip(covariances, chosen, strict=True) if used],

@@ -18,7 +18,7 @@ from rigwake.odometry.stereo import estimate_stereo
 from rigwake.pipeline.out_folder import check_camera_names, check_out_folder, used_by_one
 from rigwake.pipeline.sensor_checks import compare_sensors, vet_imu
 from rigwake.pipeline.stream_selection import Selection
-from rigwake.plausibility.values import SensorCheck
+from rigwake.plausibility.values import SensorCheck, refuse
 from rigwake.recording import (
     AttitudeStream,
     CameraStream,
@@ -61,6 +61,16 @@ class OdometryRun:
     def missing(self) -> dict[str, RigwakeError]:
         """The cameras that have none, and why."""
         return {n: r for n, r in self.results.items() if isinstance(r, RigwakeError)}
+
+    @property
+    def lens_checks(self) -> list[SensorCheck]:
+        """Lenses that do not fit their own tracks: worth a word, but a path by them is not worthless."""
+        return [c for c in self.checks if not c.agrees and "lens" in c.hypothesis]
+
+    def refuse_contradicted(self) -> None:
+        """Raises InputError where sensors, lenses aside, contradict each other."""
+        lenses = self.lens_checks
+        refuse([c for c in self.checks if c not in lenses], "What was written is not to be trusted.")
 
 
 def cameras_named(opened: Recording, camera: str) -> list[CameraStream]:

@@ -178,36 +178,28 @@ def _charts(
     colours: dict[str, int],
 ) -> dict[str, Markup]:
     residuals, tracks = content.residuals, content.tracks
+
+    def over(axis: str, values: str) -> list[Series]:
+        curves = {name: getattr(r, axis) for name, r in residuals.items()}
+        return [Series(n, c.at, getattr(c, values), colours.get(n, 0)) for n, c in curves.items()]
+
+    angle, time = "angle from the axis, degrees", "time, s"
     charts = {
         "angle": line_chart(
             "Residuals against the angle from the optical axis",
-            "angle from the axis, degrees",
+            angle,
             "median, px",
-            [
-                Series(n, r.over_angle.at, r.over_angle.median, colours.get(n, 0))
-                for n, r in residuals.items()
-            ],
+            over("over_angle", "median"),
         ),
-        "time": line_chart(
-            "Residuals over time",
-            "time, s",
-            "median, px",
-            [Series(n, r.over_time.at, r.over_time.median, colours.get(n, 0)) for n, r in residuals.items()],
-        ),
+        "time": line_chart("Residuals over time", time, "median, px", over("over_time", "median")),
         "angle_counts": line_chart(
             "Observations against the angle from the optical axis",
-            "angle from the axis, degrees",
+            angle,
             "observations",
-            [
-                Series(n, r.over_angle.at, r.over_angle.counts, colours.get(n, 0))
-                for n, r in residuals.items()
-            ],
+            over("over_angle", "counts"),
         ),
         "time_counts": line_chart(
-            "Observations over time",
-            "time, s",
-            "observations",
-            [Series(n, r.over_time.at, r.over_time.counts, colours.get(n, 0)) for n, r in residuals.items()],
+            "Observations over time", time, "observations", over("over_time", "counts")
         ),
         "tracks": line_chart(
             "Tracked points per frame",

@@ -85,7 +85,8 @@ def load_hull_picture(folder: Path, camera: str) -> HullPicture | None:
     return HullPicture(mean.astype(np.float32) / _SCALE, region > 127, "kept with the calibration")
 
 
-def load_hull_pictures(folder: Path, cameras: Iterable[str]) -> dict[str, HullPicture]:
-    """Of all cameras of which a picture is kept in a folder of masks, as `calibrate` leaves it."""
+def load_hull_pictures(calibration: Path, cameras: Iterable[str]) -> dict[str, HullPicture]:
+    """Of all cameras of which a picture is kept with a calibration: its file, or the folder that `calibrate` leaves."""
+    folder = (calibration if calibration.is_dir() else calibration.parent) / "masks"
     found = {name: load_hull_picture(folder, name) for name in cameras}
     return {name: picture for name, picture in found.items() if picture is not None}
