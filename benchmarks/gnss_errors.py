@@ -12,6 +12,7 @@ two cameras, NEES per degree of freedom of the whole rig.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -19,16 +20,17 @@ from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+
+from calibration_worlds import true_odometry
 from rigwake.config import load_config
 from rigwake.errors import RigwakeError
-from rigwake.geometry.se3 import SE3
 from rigwake.pipeline.prior import RigPrior
 from rigwake.pipeline.rig_stage import estimate_rig, initialise_rig
 from rigwake.pipeline.stream_selection import select
 from rigwake.readers.truth_files import rig_in_frame
 from rigwake.simulation.scenario import build_scenario, load_scenario
 from rigwake.simulation.tracks_only import SimulatedTracks, simulate_tracks
-from rigwake.trajectory import Trajectory
 
 SETTINGS = ("adjustment.cross_camera=false", "intrinsics=fixed")
 
@@ -54,22 +56,11 @@ def random_rig(seed: int, features: int) -> SimulatedTracks:
     return simulate_tracks(build_scenario(document, f"rig {seed}"))
 
 
-def perfect_odometry(world: SimulatedTracks) -> dict[str, Trajectory]:
-    """Each camera's true motion in its own first frame and unit: an initial guess without the answer in it."""
-    found = {}
-    for index, name in enumerate(world.tracks):
-        true = world.recording.true_trajectories[name]
-        path = true.world_from_body[0].inverse() * true.world_from_body
-        scaled = SE3(path.rotation, path.translation / (3.0 + index))
-        found[name] = Trajectory(name, world.tracks[name].timestamps_ns, scaled, is_metric=False)
-    return found
-
-
 def rig_errors(world: SimulatedTracks) -> Mapping[str, Any]:
     """Worst offset (m), relative error of the longest baseline, NEES and its degrees of freedom."""
     recording, config = world.recording, load_config(None, SETTINGS)
     selection, prior = select(recording, config), RigPrior()
-    first = initialise_rig(selection, perfect_odometry(world), config, prior)
+    first = initialise_rig(selection, true_odometry(world, metric=False), config, prior)
     rig = estimate_rig(recording, selection, world.tracks, first, config, prior, masks=Path("none"))
     found = rig.calibration
     truth = rig_in_frame(recording.true_rig, found.reference)
