@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import textwrap
 import threading
 import time
 from pathlib import Path
@@ -337,6 +338,32 @@ class TestWords:
         assert caught.value.exit_code == 143
         words = caught.value.words(["calibrate", "my sail.bag", "-o", "OUT"])
         assert words.remedy == "Go on with: rigwake calibrate 'my sail.bag' -o OUT --resume"
+
+    def test_a_process_that_cannot_tidy_up_ends_in_the_same_words(self) -> None:
+        script = """
+            import signal, time
+            from rigwake.cli import faults
+            faults._GRACE_S = 0.1
+            try:
+                with faults.signals_raise(["calibrate", "my sail.bag"]):
+                    try:
+                        signal.raise_signal(signal.SIGTERM)
+                    finally:
+                        time.sleep(60)
+            finally:
+                print("too late")
+        """
+        ended = subprocess.run(
+            [sys.executable, "-c", textwrap.dedent(script)],
+            capture_output=True,
+            text=True,
+            timeout=30,
+            check=False,
+        )
+        assert ended.returncode == 143
+        assert ended.stdout == ""
+        assert ended.stderr.startswith("rigwake: Stopped by the signal SIGTERM.")
+        assert "Go on with: rigwake calibrate 'my sail.bag' --resume" in ended.stderr
 
 
 class TestTerminals:

@@ -20,6 +20,7 @@ LAYERS = [
         "parallel",
         "_robust",
         "workers",
+        "_kernels",
         "kernel_cache",
         "text_files",
         "extras",

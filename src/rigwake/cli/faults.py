@@ -47,8 +47,11 @@ class Stopped(BaseException):
 
 
 @contextmanager
-def signals_raise() -> Iterator[None]:
-    """Within it, SIGINT, SIGTERM and SIGHUP raise Stopped, so that files and processes are tidied up."""
+def signals_raise(arguments: Sequence[str] = ()) -> Iterator[None]:
+    """Within it, SIGINT, SIGTERM and SIGHUP raise Stopped, so that files and processes are tidied up.
+
+    arguments: of the command, for the words if the process has to be ended before it has tidied up.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -59,7 +62,7 @@ def signals_raise() -> Iterator[None]:
     def stop(signum: int, frame: FrameType | None) -> None:
         for number in numbers:  # `timeout` sends it twice; a second Ctrl-C ends without tidying up
             signal.signal(number, signal.SIG_DFL if number == signal.SIGINT else signal.SIG_IGN)
-        timer = threading.Timer(_GRACE_S, _end_now, (signum,))
+        timer = threading.Timer(_GRACE_S, _end_now, (Stopped(signum), arguments))
         timer.daemon = True
         timer.start()
         deadline.append(timer)
@@ -77,13 +80,14 @@ def signals_raise() -> Iterator[None]:
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 
-def _end_now(signum: int) -> None:
+def _end_now(stopped: Stopped, arguments: Sequence[str]) -> None:
+    """End at once, in the same words: the main thread is in a long calculation that no signal interrupts."""
     for process in multiprocessing.active_children():
         with contextlib.suppress(OSError, ValueError):
             process.kill()
     with contextlib.suppress(OSError):
-        os.write(2, b"rigwake: stopped.\n")
-    os._exit(128 + signum)
+        os.write(2, f"rigwake: {stopped.words(arguments)}\n".encode(errors="backslashreplace"))
+    os._exit(stopped.exit_code)
 
 
 def silence_output() -> None:

@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `rigwake` program; ends with SystemExit. arguments: by default those of the process."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     adapt_streams()
-    with signals_raise():
+    with signals_raise(words):
         sys.exit(_exit_code(words))
 
 

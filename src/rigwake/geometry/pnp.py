@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import poselib
 from numpy.typing import NDArray
 
+from rigwake._kernels import njit
 from rigwake._types import Array, Mask
 from rigwake.errors import EstimationError
 from rigwake.geometry import so3
@@ -26,7 +26,7 @@ class AbsolutePose:
     inliers: Mask
 
 
-@numba.njit(cache=True)
+@njit()
 def _bearing_angles(R: Array, c: Array, points: Array, bearings: Array) -> Array:
     """Angles between bearings and the directions to points; R, c: world_from_cam."""
     out = np.empty(len(points))
@@ -53,7 +53,7 @@ def bearing_angles(world_from_cam: SE3, points_world: Array, bearings_cam: Array
     )
 
 
-@numba.njit(cache=True)
+@njit()
 def _tangents(b: Array, e: Array) -> None:
     """Writes two unit vectors normal to b and to each other into e (2, 3) (Duff et al., JCGT 2017)."""
     sign = 1.0 if b[2] >= 0 else -1.0
@@ -63,7 +63,7 @@ def _tangents(b: Array, e: Array) -> None:
     e[1, 0], e[1, 1], e[1, 2] = q, sign + b[1] * b[1] * p, -b[1]
 
 
-@numba.njit(cache=True)
+@njit()
 def _normal_equations(
     R: Array, c: Array, points: Array, bearings: Array, stds: Array, scale: float
 ) -> tuple[Array, Array, float]:
@@ -108,7 +108,7 @@ def _normal_equations(
     return H, g, cost
 
 
-@numba.njit(cache=True)
+@njit()
 def _moved(R: Array, c: Array, step: Array) -> tuple[Array, Array]:
     """`SE3(R, c).retract(step)`, without the cost of many small arrays."""
     w = step[:3]
@@ -125,7 +125,7 @@ def _moved(R: Array, c: Array, step: Array) -> tuple[Array, Array]:
     return R @ turn, c + R @ (along @ step[3:])
 
 
-@numba.njit(cache=True)
+@njit()
 def _minimise(
     R: Array, c: Array, points: Array, bearings: Array, stds: Array, scale: float, iterations: int
 ) -> tuple[Array, Array, Array]:

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._kernels import njit
 from rigwake._types import Array, Indices
 from rigwake.geometry.se3 import SE3
 
@@ -48,7 +48,7 @@ def triangulate_midpoint(second_from_first: SE3, bearings_first: Array, bearings
     ).points
 
 
-@numba.njit(cache=True)
+@njit()
 def _nearest_point(origins: Array, directions: Array, weights: Array, lo: int, hi: int) -> tuple[Array, bool]:
     """Minimises the weighted squared distances to the rays lo..hi."""
     A = np.zeros((3, 3))
@@ -84,20 +84,20 @@ def _nearest_point(origins: Array, directions: Array, weights: Array, lo: int, h
     return x, True
 
 
-@numba.njit(cache=True)
+@njit()
 def _direction(x: Array, origin: Array, out: Array) -> None:
     d0, d1, d2 = x[0] - origin[0], x[1] - origin[1], x[2] - origin[2]
     norm = max(np.sqrt(d0 * d0 + d1 * d1 + d2 * d2), 1e-18)
     out[0], out[1], out[2] = d0 / norm, d1 / norm, d2 / norm
 
 
-@numba.njit(cache=True)
+@njit()
 def _angle(a: Array, b: Array) -> float:
     x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
     return float(np.arctan2(np.sqrt(x * x + y * y + z * z), a[0] * b[0] + a[1] * b[1] + a[2] * b[2]))
 
 
-@numba.njit(cache=True)
+@njit()
 def _triangulate(
     origins: Array, directions: Array, starts: Indices, rounds: int
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import poselib
 
+from rigwake._kernels import njit
 from rigwake._types import Array, Indices, Mask
 from rigwake.errors import EstimationError
 from rigwake.geometry import so3
@@ -43,7 +43,7 @@ def rotation_compensated_parallax(rotation: Array, bearings_first: Array, bearin
     return np.asarray(np.arctan2(cross, np.einsum("ni,ni->n", turned, bearings_second)))
 
 
-@numba.njit(cache=True)
+@njit()
 def _sampson(R: Array, t: Array, first: Array, second: Array) -> Array:
     out = np.empty(len(first))
     E = np.empty((3, 3))

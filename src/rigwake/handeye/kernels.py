@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from rigwake._kernels import njit
 from rigwake._types import Array
 
 Transform = tuple[float, ...]
@@ -19,14 +19,14 @@ Tangent = tuple[float, ...]
 Vector = tuple[float, float, float]
 
 
-@njit(cache=True)
+@njit()
 def load(R: Array, t: Array, unit: float = 1.0) -> Transform:
     """The transform of a rotation (3, 3) and a translation (3,) in that unit."""
     a, b, c = R[0], R[1], R[2]
     return (a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2], unit * t[0], unit * t[1], unit * t[2])
 
 
-@njit(cache=True)
+@njit()
 def store(x: Transform, R: Array, t: Array) -> None:
     """Write a transform to a rotation (3, 3) and a translation (3,)."""
     R[0, 0], R[0, 1], R[0, 2] = x[0], x[1], x[2]
@@ -35,7 +35,7 @@ def store(x: Transform, R: Array, t: Array) -> None:
     t[0], t[1], t[2] = x[9], x[10], x[11]
 
 
-@njit(cache=True)
+@njit()
 def rotated(x: Transform, u: float, v: float, w: float) -> Vector:
     """The vector (u, v, w) turned by the rotation of x."""
     return (
@@ -45,13 +45,13 @@ def rotated(x: Transform, u: float, v: float, w: float) -> Vector:
     )
 
 
-@njit(cache=True)
+@njit()
 def transposed(x: Transform) -> Transform:
     """The transform with its rotation transposed and its translation as it is."""
     return (x[0], x[3], x[6], x[1], x[4], x[7], x[2], x[5], x[8], x[9], x[10], x[11])
 
 
-@njit(cache=True)
+@njit()
 def times(a: Transform, b: Transform) -> Transform:
     """`a b`."""
     p, q = rotated(a, b[0], b[3], b[6]), rotated(a, b[1], b[4], b[7])
@@ -59,7 +59,7 @@ def times(a: Transform, b: Transform) -> Transform:
     return (p[0], q[0], r[0], p[1], q[1], r[1], p[2], q[2], r[2], a[9] + t[0], a[10] + t[1], a[11] + t[2])
 
 
-@njit(cache=True)
+@njit()
 def inverse_times(a: Transform, b: Transform) -> Transform:
     """`a^-1 b`."""
     R = transposed(a)
@@ -68,7 +68,7 @@ def inverse_times(a: Transform, b: Transform) -> Transform:
     return (p[0], q[0], r[0], p[1], q[1], r[1], p[2], q[2], r[2], t[0], t[1], t[2])
 
 
-@njit(cache=True)
+@njit()
 def rotation_vector(x: Transform) -> Vector:
     """Logarithm of the rotation of x."""
     trace = x[0] + x[4] + x[8]
@@ -94,7 +94,7 @@ def rotation_vector(x: Transform) -> Vector:
     return (factor * u, factor * v, factor * w)
 
 
-@njit(cache=True)
+@njit()
 def _twice_crossed(phi: Vector, v: Vector, once: float, twice: float) -> Vector:
     """`v + once phi x v + twice phi x (phi x v)`."""
     x = phi[1] * v[2] - phi[2] * v[1]
@@ -107,7 +107,7 @@ def _twice_crossed(phi: Vector, v: Vector, once: float, twice: float) -> Vector:
     )
 
 
-@njit(cache=True)
+@njit()
 def log(x: Transform) -> Tangent:
     """Tangent of a transform."""
     phi = rotation_vector(x)
@@ -121,7 +121,7 @@ def log(x: Transform) -> Tangent:
     return (phi[0], phi[1], phi[2], rho[0], rho[1], rho[2])
 
 
-@njit(cache=True)
+@njit()
 def exp(tangent: Tangent) -> Transform:
     """Transform of a tangent."""
     x, y, z, u, v, w = tangent
@@ -138,7 +138,7 @@ def exp(tangent: Tangent) -> Transform:
     return (p, xy - az, xz + ay, xy + az, q, yz - ax, xz - ay, yz + ax, r, t[0], t[1], t[2])
 
 
-@njit(cache=True)
+@njit()
 def bracket(x: Tangent, y: Tangent) -> Tangent:
     """`[x, y] = ad(x) y`."""
     return (
@@ -151,7 +151,7 @@ def bracket(x: Tangent, y: Tangent) -> Tangent:
     )
 
 
-@njit(cache=True)
+@njit()
 def motions(R: Array, t: Array, starts: NDArray[np.int64], stride: int) -> tuple[Array, Array]:
     """Motions `V_k^-1 V_k+stride` of the poses k in `starts`, as rotations and translations."""
     rotations, translations = np.empty((len(starts), 3, 3)), np.empty((len(starts), 3))
@@ -162,7 +162,7 @@ def motions(R: Array, t: Array, starts: NDArray[np.int64], stride: int) -> tuple
     return rotations, translations
 
 
-@njit(cache=True)
+@njit()
 def rotation_vectors(R: Array) -> Array:
     """Logarithms (N, 3) of N rotations."""
     out, zero = np.empty((len(R), 3)), np.zeros(3)
@@ -171,7 +171,7 @@ def rotation_vectors(R: Array) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit()
 def tangents(R: Array, t: Array) -> Array:
     """Logarithms (N, 6) of N transforms."""
     out = np.empty((len(t), 6))
@@ -180,17 +180,17 @@ def tangents(R: Array, t: Array) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit()
 def _write(x: Tangent, out: Array) -> None:
     out[0], out[1], out[2], out[3], out[4], out[5] = x
 
 
-@njit(cache=True)
+@njit()
 def _read(x: Array, factor: float) -> Tangent:
     return (factor * x[0], factor * x[1], factor * x[2], factor * x[3], factor * x[4], factor * x[5])
 
 
-@njit(cache=True)
+@njit()
 def retracted(R: Array, t: Array, deltas: Array) -> tuple[Array, Array]:
     """N transforms times the exponentials of N tangents."""
     rotations, translations = np.empty((len(t), 3, 3)), np.empty((len(t), 3))
@@ -200,7 +200,7 @@ def retracted(R: Array, t: Array, deltas: Array) -> tuple[Array, Array]:
     return rotations, translations
 
 
-@njit(cache=True)
+@njit()
 def misfit(
     AR: Array, At: Array, BR: Array, Bt: Array, scales: Array, XR: Array, Xt: Array
 ) -> tuple[float, float]:
@@ -216,7 +216,7 @@ def misfit(
     return turned / (9 * len(At)), moved / (3 * len(At))
 
 
-@njit(cache=True)
+@njit()
 def disagreement(AR: Array, BR: Array, R: Array) -> float:
     """Norm of all `R_A R - R R_B`."""
     total, zero = 0.0, np.zeros(3)
@@ -228,7 +228,7 @@ def disagreement(AR: Array, BR: Array, R: Array) -> float:
     return np.sqrt(total)
 
 
-@njit(cache=True)
+@njit()
 def _first_from(times_s: Array, x: float) -> int:
     """Index of the first time not before x, by bisection (np.searchsorted takes seconds to compile)."""
     low, high = 0, len(times_s)
@@ -241,7 +241,7 @@ def _first_from(times_s: Array, x: float) -> int:
     return low
 
 
-@njit(cache=True)
+@njit()
 def sample(
     times_s: Array,
     R: Array,
@@ -280,7 +280,7 @@ def sample(
     return rotations, translations, velocities, segments
 
 
-@njit(cache=True)
+@njit()
 def _cubic(D: Tangent, start: Tangent, end: Tangent, a: float) -> Tangent:
     """The cubic over the increment D at the fraction `a` of it; start, end: velocities times its duration."""
     turned = bracket(D, end)  # half of it: J_r^-1(D) to first order
@@ -296,13 +296,13 @@ def _cubic(D: Tangent, start: Tangent, end: Tangent, a: float) -> Tangent:
     )
 
 
-@njit(cache=True)
+@njit()
 def _carried(A: Transform, G: Transform, X: Transform) -> Transform:
     """`G^-1 A X`: the motion or pose of the reference, as the member would have it."""
     return inverse_times(G, times(A, X))
 
 
-@njit(cache=True)
+@njit()
 def residuals(
     AR: Array,
     At: Array,
@@ -327,7 +327,7 @@ def residuals(
     return out
 
 
-@njit(cache=True)
+@njit()
 def agreed_motions(
     AR: Array,
     At: Array,
@@ -361,7 +361,7 @@ def agreed_motions(
     return adjoints, ways
 
 
-@njit(cache=True)
+@njit()
 def jacobians(
     adjoints: Array,
     ways: Array,

@@ -16,14 +16,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from rigwake._kernels import njit
 from rigwake._types import Array
 
 
-@njit(cache=True)
+@njit()
 def innovations(rows: Array, rotation: float, translation: float) -> Array:
     """`e_k = row_k + theta e_(k-1)` along time over rows (N, 6, P), the first three with theta `rotation`."""
     out = rows.copy()
@@ -36,7 +36,7 @@ def innovations(rows: Array, rotation: float, translation: float) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit()
 def robust_mean(squared: Array, median_of_unit: float, limit: float) -> float:
     """Mean with outliers pulled in to `limit` times the scale that the median tells."""
     if len(squared) == 0:
@@ -48,7 +48,7 @@ def robust_mean(squared: Array, median_of_unit: float, limit: float) -> float:
     return total / len(squared)
 
 
-@njit(cache=True)
+@njit()
 def squared_lengths(rows: Array, known: NDArray[np.bool_], first: int) -> Array:
     """`|r|^2` of the three columns from `first` on, of the known rows."""
     out, i = np.empty(known.sum()), 0
@@ -59,7 +59,7 @@ def squared_lengths(rows: Array, known: NDArray[np.bool_], first: int) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit()
 def prediction_errors(
     rows: Array, known: NDArray[np.bool_], thetas: Array, median_of_unit: float, limit: float
 ) -> Array:
@@ -73,7 +73,7 @@ def prediction_errors(
     return out
 
 
-@njit(cache=True)
+@njit()
 def learnt_covariances(
     rows: Array, known: NDArray[np.bool_], by_axis: bool, floor: float, median_of_unit: float, limit: float
 ) -> Array:
@@ -88,7 +88,7 @@ def learnt_covariances(
     return out
 
 
-@njit(cache=True)
+@njit()
 def subtract_arm_variance(moved: Array, turned: Array, arm: Array, fraction: float, floor: float) -> Array:
     """Covariance (3, 3) of translations less what the fraction of the rotations' moves the arm by; no direction below
     a twentieth of the widest."""
@@ -106,7 +106,7 @@ def subtract_arm_variance(moved: Array, turned: Array, arm: Array, fraction: flo
     return out
 
 
-@njit(cache=True)
+@njit()
 def _sandwich(A: Array, covariance: Array, out: Array) -> None:
     """`out = A covariance A^T`, in loops: small, and quicker to compile than calls of BLAS."""
     p, q = A.shape
@@ -122,7 +122,7 @@ def _sandwich(A: Array, covariance: Array, out: Array) -> None:
                 out[i, j] += left[i, k] * A[j, k]
 
 
-@njit(cache=True)
+@njit()
 def _robust_covariance(
     rows: Array,
     known: NDArray[np.bool_],
@@ -156,7 +156,7 @@ def _robust_covariance(
                         out[i, j] += fraction * rows[k, first + i] * rows[k, first + j]
 
 
-@njit(cache=True)
+@njit()
 def split(R: Array, found: Array, fractions: Array) -> tuple[Array, Array]:
     """Covariances (M, 2, 3, 3) of the errors of both sides as the reference's (1, 6, 6), the mean of its `fractions`
     (2, M) in its own axes, and the members' (M, 1, 6, 6)."""
@@ -173,7 +173,7 @@ def split(R: Array, found: Array, fractions: Array) -> tuple[Array, Array]:
     return reference, members
 
 
-@njit(cache=True)
+@njit()
 def propagated(R: Array, t: Array, reference: Array, members: Array, floor: Array) -> tuple[Array, Array]:
     """Covariances (n, 6 M, 6 M) of the residuals of M mountings and the part of the reference; see `known_noise`."""
     count = len(R)
@@ -244,7 +244,7 @@ def levels_by_lever_arm(
     return LeverArmLevels(float(found), float(level))
 
 
-@njit(cache=True)
+@njit()
 def _levels(residuals: Array, arm: Array, v: float, given: float) -> tuple[float, float]:
     squares = _squares(residuals, arm)
     length2 = arm[0] * arm[0] + arm[1] * arm[1] + arm[2] * arm[2]
@@ -266,7 +266,7 @@ def _levels(residuals: Array, arm: Array, v: float, given: float) -> tuple[float
     return fraction, q
 
 
-@njit(cache=True)
+@njit()
 def _squares(residuals: Array, arm: Array) -> Array:
     """(N, 5) of every residual: |r_R|^2, r_t^2 along the arm, across it, (p x r_R) . r_t, |p x r_R|^2."""
     length = math.sqrt(arm[0] * arm[0] + arm[1] * arm[1] + arm[2] * arm[2])
@@ -288,7 +288,7 @@ def _squares(residuals: Array, arm: Array) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit()
 def _weighted_means(squares: Array, fraction: float, turned: float, along: float, across: float) -> Array:
     """(5,) means over the residuals, outliers of these variances weighing less."""
     sums = np.zeros(5)
@@ -302,7 +302,7 @@ def _weighted_means(squares: Array, fraction: float, turned: float, along: float
     return sums
 
 
-@njit(cache=True)
+@njit()
 def _weight(squared: float) -> float:
     """Huber's weight of a residual in a covariance, falling faster beyond `_FAR` times the limit."""
     ratio = _LIMIT / max(squared, 1e-300)
@@ -311,13 +311,13 @@ def _weight(squared: float) -> float:
     return math.sqrt(ratio) if ratio * _FAR * _FAR > 1 else _FAR * ratio
 
 
-@njit(cache=True)
+@njit()
 def _across(fraction: float, means: Array) -> float:
     """Mean square per axis across the arm of what the fraction leaves."""
     return (means[2] - 2 * fraction * means[3] + fraction * fraction * means[4]) / 2
 
 
-@njit(cache=True)
+@njit()
 def _level(fraction: float, means: Array, arm_variance: float) -> float:
     """q that maximises the likelihood, by Fisher scoring."""
     least = _LEAST * (means[1] + means[2]) + TRANSLATION_FLOOR**2
@@ -329,7 +329,7 @@ def _level(fraction: float, means: Array, arm_variance: float) -> float:
     return q
 
 
-@njit(cache=True)
+@njit()
 def _cost(logit: float, means: Array, arm_variance: float, count: int) -> float:
     """Minus twice the logarithm of the likelihood and the prior per residual, at the best q."""
     fraction = _fraction_of(logit)
@@ -339,7 +339,7 @@ def _cost(logit: float, means: Array, arm_variance: float, count: int) -> float:
     return cost - 2 * math.log(fraction * (1 - fraction)) / max(count, 1)
 
 
-@njit(cache=True)
+@njit()
 def _best_logit(means: Array, arm_variance: float, count: int) -> float:
     """The best of a grid of shares."""
     best, lowest = 0.0, math.inf
@@ -351,7 +351,7 @@ def _best_logit(means: Array, arm_variance: float, count: int) -> float:
     return best
 
 
-@njit(cache=True)
+@njit()
 def _refined(logit: float, means: Array, arm_variance: float, count: int) -> float:
     """Golden section about a value of the grid, so that the fraction does not jump when the residuals hardly move."""
     low, high = logit - _STEP, logit + _STEP
@@ -369,6 +369,6 @@ def _refined(logit: float, means: Array, arm_variance: float, count: int) -> flo
     return (low + high) / 2
 
 
-@njit(cache=True)
+@njit()
 def _fraction_of(logit: float) -> float:
     return 1 / (1 + math.exp(-logit))

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from rigwake._kernels import njit
 from rigwake._types import Array
 
 _TILE = 2048  # steps at a time: fits the cache
 
 
-@njit(cache=True)
+@njit()
 def inverted(total: Array, of_reference: Array) -> tuple[Array, Array, Array]:
     """Of covariances (n, p, p): `S^-1`, `Sa S^-1` and `Sa - Sa S^-1 Sa`. S is scaled to unit diagonal to be
     inverted (rotation and translation differ by many decades)."""
@@ -38,7 +38,7 @@ def inverted(total: Array, of_reference: Array) -> tuple[Array, Array, Array]:
     return inverses, gains, left
 
 
-@njit(cache=True)
+@njit()
 def weigh(
     residuals: Array,
     filtered: Array,
@@ -74,7 +74,7 @@ def weigh(
     return weighted
 
 
-@njit(cache=True)
+@njit()
 def add_information(
     Jm: Array,
     Jn: Array,
@@ -115,7 +115,7 @@ def add_information(
                 out[at[0] + r, at[1] + c] += total[r, c]
 
 
-@njit(cache=True)
+@njit()
 def _tile(J: Array, steps: NDArray[np.int64], weights: Array) -> Array:
     """(6, n, P): `sqrt(rho) J` of the steps, rows first, so that one product of matrices serves all of them."""
     out = np.empty((6, len(steps), J.shape[2]))
@@ -128,7 +128,7 @@ def _tile(J: Array, steps: NDArray[np.int64], weights: Array) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit()
 def add_scores(J: Array, weighted: Array, first: int, steps: NDArray[np.int64], out: Array, at: int) -> None:
     """`out[k] += J_k^T weighted_i` for the i-th of the steps k; weighted from column `first` on, out from `at` on."""
     for i in range(len(steps)):
@@ -138,7 +138,7 @@ def add_scores(J: Array, weighted: Array, first: int, steps: NDArray[np.int64], 
                 out[k, at + c] += J[k, a, c] * weighted[i, first + a]
 
 
-@njit(cache=True)
+@njit()
 def spurious(
     covariances: Array,
     weights: Array,
@@ -179,7 +179,7 @@ def spurious(
     return total
 
 
-@njit(cache=True)
+@njit()
 def _carried_by_steps(M: Array, adjoints: Array, ways: Array, steps: NDArray[np.int64]) -> Array:
     """`sum_k Z_k^T M Z_k` (7, 7), `Z = [[Ad(C^-1), [0, way]], [0, 1]]`."""
     n = len(steps)
@@ -195,7 +195,7 @@ def _carried_by_steps(M: Array, adjoints: Array, ways: Array, steps: NDArray[np.
     return np.dot(Z.reshape(7 * n, 7).T, MZ.reshape(7 * n, 7))
 
 
-@njit(cache=True)
+@njit()
 def _error_units() -> Array:
     """(6, 7, 6): `D(e)^T`, `D(e) = [ad(e), -[0, e_t]]`, of the six unit errors."""
     units = np.zeros((6, 7, 6))
@@ -208,7 +208,7 @@ def _error_units() -> Array:
     return units
 
 
-@njit(cache=True)
+@njit()
 def _spread(units: Array, covariance: Array, W: Array) -> Array:
     """`E[D(e)^T W D(e)]` (7, 7) over errors e of the covariance."""
     mixed = np.dot(covariance, units.reshape(6, 42)).reshape(6, 7, 6)
@@ -222,7 +222,7 @@ def _spread(units: Array, covariance: Array, W: Array) -> Array:
     return total
 
 
-@njit(cache=True)
+@njit()
 def split_observable(
     information: Array, spurious: Array, required_ratio: float, rounding: float
 ) -> tuple[Array, Array, Array]:
@@ -264,7 +264,7 @@ def split_observable(
     return whitened[:, first:].copy(), genuine[first:].copy(), rest
 
 
-@njit(cache=True)
+@njit()
 def bounded_step(basis: Array, scores: Array, limits: Array) -> tuple[Array, float]:
     """The Gauss-Newton step in the whitened `basis`, no unknown beyond its limit, and its length in whitened units."""
     gradient, step = np.zeros(len(basis)), np.zeros(len(basis))

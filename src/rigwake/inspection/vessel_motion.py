@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from rigwake._kernels import njit
 from rigwake._types import Array, Stamps
 from rigwake.recording import GnssStream, ImuStream
 
@@ -49,7 +49,7 @@ class Travel:
     speed: Array
 
 
-@numba.njit(cache=True)
+@njit()
 def _levelled(gyro: Array, up_measured: Array, steps_s: Array, settling_s: float, R: Array) -> Array:
     """Complementary filter (Mahony et al. 2008): (N, 3, 3) `world_from_imu`, z up, heading from the gyro alone.
 

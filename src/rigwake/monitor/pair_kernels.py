@@ -19,15 +19,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from rigwake._kernels import njit
 from rigwake._types import Array, Indices
 
 MOUNTING = 7  # unknowns of a camera: rotation, translation, clock
 LOSS_STDS = 3.0
 COLUMNS = 14  # the seven, the rig's rotation and velocity, the residual
 
-_options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+_options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
 @njit(**_options)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 from numba import types
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
+from rigwake._kernels import njit
+
 # no `nnan`, `ninf`: misses are infinite. Inlined by LLVM: a call would copy the arrays' descriptors each time
 _FAST = {"contract", "reassoc", "arcp", "nsz", "afn"}
-loop = numba.njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
-inlined = numba.njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy", forceinline=True)
+loop = njit(nogil=True, fastmath=_FAST, error_model="numpy")
+inlined = njit(nogil=True, fastmath=_FAST, error_model="numpy", forceinline=True)
 
 
 @intrinsic

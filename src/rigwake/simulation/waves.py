@@ -12,11 +12,11 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from rigwake._kernels import njit
 from rigwake._types import Array
 from rigwake.simulation.scenario import Sea
 
@@ -160,7 +160,7 @@ def raft_motion(field: WaveField, hull: SelfMaskResponse, times_s: Array, planar
     return result
 
 
-@numba.njit(cache=True)
+@njit()
 def _sinc_and_j1(x: float) -> tuple[float, float]:
     """`sin(x) / x` and the spherical Bessel function j1 (`sin(x)/x^2 - cos(x)/x`)."""
     if abs(x) < 1e-2:
@@ -169,7 +169,7 @@ def _sinc_and_j1(x: float) -> tuple[float, float]:
     return sinc, (sinc - math.cos(x)) / x
 
 
-@numba.njit(cache=True)
+@njit()
 def _sum_raft(
     k: Array,
     omega: Array,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from rigwake._kernels import njit
 from rigwake._types import Array, Image, Mask
 
 _BLOCK_PX = 7  # window of the structure tensor
@@ -75,7 +75,7 @@ def detect_corners(
     return candidates[served[:wanted]]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _claim(free: Mask, rows: NDArray[np.int64], columns: NDArray[np.int64], reach: int) -> Mask:
     """Which points (N,), in order, find their pixel free; each claims all pixels nearer than `reach`."""
     height, width = free.shape

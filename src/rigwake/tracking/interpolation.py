@@ -12,10 +12,10 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from rigwake._kernels import njit
 from rigwake._types import Image
 
 Coefficients = NDArray[np.float32]
@@ -24,7 +24,7 @@ _POLE = sqrt(3.0) - 2.0
 _HORIZON = 12  # the pole's 12th power is 1e-7: what lies further away cannot be seen in float32
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def spline_coefficients(image: Image) -> Coefficients:
     """Cubic B-spline coefficients of an image, mirrored at its borders: (H, W) -> (H, W); both sides >= 13."""
     height, width = image.shape

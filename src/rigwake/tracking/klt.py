@@ -11,10 +11,10 @@ from math import floor, sqrt
 
 import cv2
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from rigwake._kernels import njit
 from rigwake._types import Array, Image, Mask
 from rigwake.parallel import over_ranges, ranges
 
@@ -82,7 +82,7 @@ def _lucas_kanade(
 
 # What it calls is inlined: a function of its own has two copies, one of them optimised again inside its caller, and
 # which one runs would differ between the process that compiles and those that load, by a rounding of sums.
-@njit(cache=True, nogil=True, fastmath=SUMS_IN_ANY_ORDER)
+@njit(nogil=True, fastmath=SUMS_IN_ANY_ORDER)
 def _search(  # type: ignore[no-untyped-def]
     before, after, start, landed, found, scale, finest, window_px, padded
 ):

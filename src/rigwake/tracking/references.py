@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from rigwake._kernels import njit
 from rigwake._tables import join_rows, take_rows
 from rigwake._types import Array, Floats, Mask
 from rigwake.tracking.interpolation import Coefficients, sample_with_gradient
@@ -106,7 +106,7 @@ def registration_bias(references: References, warps: Array, second_order: Array)
     return np.asarray((warps @ references.bias_responses @ in_patch)[:, :, 0])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _make_references(
     coefficients: Coefficients, pixels: Array, offsets: Floats, root_weights: Floats
 ) -> tuple[Floats, Array, Array, Array, Mask]:

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from rigwake._kernels import njit
 from rigwake._types import Array, Floats, Mask
 from rigwake.parallel import over_ranges, ranges
 from rigwake.tracking.interpolation import Coefficients, sample
@@ -106,7 +106,7 @@ def _noise_bandwidth(lag_sums: Array) -> float:
 
 
 # what it calls is inlined for the reason given in `klt.py`
-@njit(cache=True, nogil=True, fastmath=SUMS_IN_ANY_ORDER)
+@njit(nogil=True, fastmath=SUMS_IN_ANY_ORDER)
 def _register(  # type: ignore[no-untyped-def]
     first, last, coefficients, pattern, information, contrast, offsets, root_weights, lower_right, lower_left,
     warp_precision, noise_variance, max_shift_px, iterations, pixels, warps, found, correlation, variance, spread,

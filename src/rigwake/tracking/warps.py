@@ -10,8 +10,8 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numba import njit
 
+from rigwake._kernels import njit
 from rigwake._robust import MAD_TO_STD
 from rigwake._types import Array, Mask
 from rigwake.geometry import so3
@@ -33,7 +33,7 @@ def dominant_rotation(bearings_before: Array, bearings_after: Array) -> Array:
     return np.asarray(_kabsch(np.ascontiguousarray(bearings_before), np.ascontiguousarray(bearings_after)))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _kabsch(before: Array, after: Array) -> Array:
     weights, error, rotation = np.ones(len(before)), np.empty(len(before)), np.eye(3)
     for _ in range(_ROUNDS):

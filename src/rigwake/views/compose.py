@@ -8,9 +8,9 @@ bilinear taps, and one weighting per camera that shows it.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from rigwake._kernels import njit
 from rigwake._types import Floats, Image
 from rigwake.parallel import over_ranges, ranges
 from rigwake.views.lookup import STEP, CoarseLookup
@@ -57,7 +57,7 @@ def compose(
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _corner_state(pixels, weights, c, i, j, height, width):  # type: ignore[no-untyped-def]
     """0: the camera shows nothing in the cell; 1: it lies inside the image altogether; 2: only partly, or unsure."""
     w = max(weights[c, i, j], weights[c, i, j + 1], weights[c, i + 1, j], weights[c, i + 1, j + 1])
@@ -76,7 +76,7 @@ def _corner_state(pixels, weights, c, i, j, height, width):  # type: ignore[no-u
     return state
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _compose_rows(stack, pixels, bends, weights, usable, gains, shading, plain, out, first, last):  # type: ignore[no-untyped-def]
     cameras, source_height, source_width = stack.shape[0], stack.shape[1], stack.shape[2]
     height, width = out.shape[0], out.shape[1]
@@ -125,7 +125,7 @@ def _compose_rows(stack, pixels, bends, weights, usable, gains, shading, plain, 
                         out[v, u, ch] = min(int(total[k, ch] * scale + np.float32(0.5)), 255)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, inline="always")
+@njit(nogil=True, error_model="numpy", boundscheck=False, inline="always")
 def _fixed(pixels, bends, c, i, j, axis):  # type: ignore[no-untyped-def]
     """Fixed-point position at the cell's corner, its steps along a row and down a column, the twist, and the
     curvatures along and down: `p(k, m) = p00 + k a + m d + k m t + (ca k (k - 8) + cd m (m - 8)) / 128`."""
@@ -142,7 +142,7 @@ def _fixed(pixels, bends, c, i, j, axis):  # type: ignore[no-untyped-def]
     return start, along, down, twist, bend_along, bend_down
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _one_camera(  # type: ignore[no-untyped-def]
     flat, pixels, bends, gains, shading, plain, out, c, i, j, v0, v1, u0, u1, base, stride
 ):  # fmt: skip
@@ -190,7 +190,7 @@ def _one_camera(  # type: ignore[no-untyped-def]
             dy += yb
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _blend_camera(  # type: ignore[no-untyped-def]
     flat, usable, pixels, bends, weights, gains, shading, plain, total, c, i, j, rows, columns, height, width, partly
 ):  # fmt: skip

@@ -12,9 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from scipy.linalg import cho_factor, cho_solve
 
+from rigwake._kernels import njit
 from rigwake._types import Array, Indices
 from rigwake.ba.solver.envelope import Envelope, Factor, NotPositiveDefiniteError, cholesky
 from rigwake.ba.solver.parameter_layout import ParameterLayout
@@ -192,7 +192,7 @@ class ReducedEquations:
         return np.concatenate([states, shared])
 
 
-@njit(cache=True)
+@njit()
 def _scatter_blocks(blocks, columns, states, border, corner, tile, first, offsets):  # type: ignore[no-untyped-def]
     """Add symmetric blocks (n, q, q) at `columns` (n, q) to the lower triangle; -1 is left out."""
     n, q = len(border), columns.shape[1]
@@ -219,7 +219,7 @@ def _apart(bounds: Indices, states: Indices) -> Indices:
     return np.unique(np.concatenate([[0], clear[np.searchsorted(clear, bounds[1:])]]))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _position(i, j, n, tile, first, offsets):  # type: ignore[no-untyped-def]
     """Where row i, column j <= i lies in the values of an `Envelope`."""
     t = i // tile
@@ -227,7 +227,7 @@ def _position(i, j, n, tile, first, offsets):  # type: ignore[no-untyped-def]
     return offsets[t] + (i - t * tile) * width + j - first[t] * tile
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _scatter_states(  # type: ignore[no-untyped-def]
     begin, end, blocks, row_starts, partners, columns, by_states, w, n, states, tile, first, offsets
 ):
@@ -254,7 +254,7 @@ def _scatter_states(  # type: ignore[no-untyped-def]
                     _add_symmetric(product, columns[f, a], of_state[b], w, n, states, tile, first, offsets)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_symmetric(product, row, column, w, n, states, tile, first, offsets):  # type: ignore[no-untyped-def]
     """Add a block (w, w) that starts at a row and column, and its transpose, to the lower triangle."""
     for i in range(w):
@@ -268,7 +268,7 @@ def _add_symmetric(product, row, column, w, n, states, tile, first, offsets):  #
                 states[at + j] += product[j, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _scatter_coupling(coupling, jacobian, columns, n, border, corner):  # type: ignore[no-untyped-def]
     """Add `J_f^T c` of every frame and shared parameter that it has to do with."""
     for f in range(coupling.shape[0]):
@@ -288,7 +288,7 @@ def _scatter_coupling(coupling, jacobian, columns, n, border, corner):  # type: 
                     corner[column - n, k] += total
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _scatter_shared(  # type: ignore[no-untyped-def]
     origin,
     begin,
@@ -313,7 +313,7 @@ def _scatter_shared(  # type: ignore[no-untyped-def]
             _add_columns(blocks[columns[slot]].T, by_shared[g], shared[g], coupling[f - origin])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_columns(S, B, columns, out):  # type: ignore[no-untyped-def]
     for a in range(len(columns)):
         for m in range(6):
@@ -323,7 +323,7 @@ def _add_columns(S, B, columns, out):  # type: ignore[no-untyped-def]
                     out[columns[a], i] += S[i, m] * B[m, a]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_product(factor, a, b, out):  # type: ignore[no-untyped-def]
     """`out += factor a b`, row by row so that the inner loop is contiguous."""
     for i in range(out.shape[0]):

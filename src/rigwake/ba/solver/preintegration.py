@@ -14,8 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from rigwake._kernels import njit
 from rigwake._types import Array, Indices
 from rigwake.ba.solver.rig_problem import RigProblem
 from rigwake.errors import UsageError
@@ -149,14 +149,14 @@ def preintegrate(problem: RigProblem, starts_s: Array, ends_s: Array, states: In
     )
 
 
-@njit(cache=True)
+@njit()
 def _matmul3(a, b, out):  # type: ignore[no-untyped-def]
     for i in range(3):
         for j in range(3):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
 
 
-@njit(cache=True)
+@njit()
 def _exp3(v, out, jacobian):  # type: ignore[no-untyped-def]
     """Rotation and right Jacobian of a rotation vector."""
     angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
@@ -180,7 +180,7 @@ def _exp3(v, out, jacobian):  # type: ignore[no-untyped-def]
         jacobian[j, i] -= b * v[k]
 
 
-@njit(cache=True)
+@njit()
 def _sample(times, signal, t, index, out):  # type: ignore[no-untyped-def]
     """The signal at time t, linear between samples `index` and `index + 1`, held outside them."""
     fraction = (t - times[index]) / (times[index + 1] - times[index])
@@ -189,7 +189,7 @@ def _sample(times, signal, t, index, out):  # type: ignore[no-untyped-def]
         out[i] = (1 - fraction) * signal[index, i] + fraction * signal[index + 1, i]
 
 
-@njit(cache=True)
+@njit()
 def _minus_rotated_hat(R, a, out):  # type: ignore[no-untyped-def]
     """`-R hat(a)`: derivative of R a by the right tangent of R."""
     for i in range(3):
@@ -198,7 +198,7 @@ def _minus_rotated_hat(R, a, out):  # type: ignore[no-untyped-def]
         out[i, 2] = R[i, 1] * a[0] - R[i, 0] * a[1]
 
 
-@njit(cache=True)
+@njit()
 def _spread(covariance, A, B, work):  # type: ignore[no-untyped-def]
     """`A covariance A^T + B` in place; A (9, 9), B (9,) diagonal."""
     for i in range(9):
@@ -216,7 +216,7 @@ def _spread(covariance, A, B, work):  # type: ignore[no-untyped-def]
         covariance[i, i] += B[i]
 
 
-@njit(cache=True)
+@njit()
 def _integrate_all(  # type: ignore[no-untyped-def]
     times, gyro, accel, starts, ends, gyro_bias, accel_bias, noise, rotation, vectors, by_bias, covariance
 ):
@@ -250,14 +250,14 @@ def _integrate_all(  # type: ignore[no-untyped-def]
         moved[2] = w0
 
 
-@njit(cache=True)
+@njit()
 def _bias_free(times, signal, t, index, bias, out):  # type: ignore[no-untyped-def]
     _sample(times, signal, t, index, out)
     for i in range(3):
         out[i] -= bias[i]
 
 
-@njit(cache=True)
+@njit()
 def _advance(dt, w0, w1, a0, a1, R, vectors, by_bias, A, scratch):  # type: ignore[no-untyped-def]
     """One step between rates w0, w1 and accelerations a0, a1 at its ends: increments, their derivatives by the
     biases, and the transition A (9, 9) of their errors."""
@@ -287,7 +287,7 @@ def _advance(dt, w0, w1, a0, a1, R, vectors, by_bias, A, scratch):  # type: igno
     R[:], Rg[:] = R1, Rg1
 
 
-@njit(cache=True)
+@njit()
 def _move(dt, a0, a1, R, R1, v, p):  # type: ignore[no-untyped-def]
     """Velocity and position, with a force that varies linearly."""
     for i in range(3):
@@ -297,7 +297,7 @@ def _move(dt, a0, a1, R, R1, v, p):  # type: ignore[no-untyped-def]
         v[i] += (f0 + f1) * dt / 2
 
 
-@njit(cache=True)
+@njit()
 def _move_by_bias(dt, R, R1, H0, H1, Rg1, by_bias):  # type: ignore[no-untyped-def]
     """Derivatives of velocity and position by both biases."""
     Rg, Vg, Va, Pg, Pa = by_bias[0], by_bias[1], by_bias[2], by_bias[3], by_bias[4]
@@ -311,7 +311,7 @@ def _move_by_bias(dt, R, R1, H0, H1, Rg1, by_bias):  # type: ignore[no-untyped-d
             Va[i, j] -= (R[i, j] + R1[i, j]) * dt / 2
 
 
-@njit(cache=True)
+@njit()
 def _step_noise(noise, size, sample_step, B):  # type: ignore[no-untyped-def]
     """B (9,): what sensor noise adds in a step of this size (s); across a gap, what the signal may have done unseen."""
     gyro_bridge, accel_bridge = 0.0, 0.0

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from rigwake._kernels import njit
 from rigwake._types import Array, Indices, Mask
 from rigwake.ba.solver.camera_frames import Frames
 from rigwake.ba.solver.extrapolation import extrapolated
@@ -208,7 +208,7 @@ def _fill_extras(
             start = stop
 
 
-@njit(cache=True)
+@njit()
 def _directions(  # type: ignore[no-untyped-def]
     rotations, positions, frames, landmarks, anchors, bearings, inverse_ranges, out
 ):
@@ -222,7 +222,7 @@ def _directions(  # type: ignore[no-untyped-def]
             out[m, i] = rotations[f, 0, i] * w[0] + rotations[f, 1, i] * w[1] + rotations[f, 2, i] * w[2]
 
 
-@njit(cache=True)
+@njit()
 def _derivatives(  # type: ignore[no-untyped-def]
     rotations,
     positions,

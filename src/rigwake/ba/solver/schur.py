@@ -13,8 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from rigwake._kernels import njit
 from rigwake._types import Array, Indices
 from rigwake.parallel import over_ranges, ranges
 
@@ -107,7 +107,7 @@ def frame_pairs(landmark_starts: Indices, frames: Indices, n_frames: int) -> Fra
     )
 
 
-@njit(cache=True)
+@njit()
 def _count_or_list(landmark_starts, frames, frame_starts, landmarks, cursor, partners):  # type: ignore[no-untyped-def]
     """Count (empty `partners`) or list, from `cursor` on, the partners of every frame, itself included."""
     n_frames = len(frame_starts) - 1
@@ -179,7 +179,7 @@ def eliminate_landmarks(
     return equations
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _invert_damped(V, damping, out):  # type: ignore[no-untyped-def]
     """Inverse of the symmetric 3x3 `V + damping diag(V)`, by its adjugate after scaling to unit diagonal."""
     s = np.empty(3)
@@ -198,7 +198,7 @@ def _invert_damped(V, damping, out):  # type: ignore[no-untyped-def]
             out[i, j] *= s[i] * s[j]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sum_up_landmarks(  # type: ignore[no-untyped-def]
     first, last, starts, r, Jf, Jl, Je, extras, damping, coupling, extras_coupling, inverses, gradient
 ):
@@ -223,7 +223,7 @@ def _sum_up_landmarks(  # type: ignore[no-untyped-def]
             _invert_damped(V, damping, inverses[landmark])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sum_up_frames(  # type: ignore[no-untyped-def]
     first, last, row_starts, observation_starts, observations, r, Jf, Je, extras, blocks, gradient, diagonal,
     with_extras,
@@ -245,7 +245,7 @@ def _sum_up_frames(  # type: ignore[no-untyped-def]
                         with_extras[f, i, extras[m, a]] += x * Je[m, 0, a] + y * Je[m, 1, a]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sum_up_extras(r, Je, extras, corner, gradient, diagonal):  # type: ignore[no-untyped-def]
     """`J^T J` and `-J^T r` of the extras."""
     for m in range(len(r)):
@@ -261,7 +261,7 @@ def _sum_up_extras(r, Je, extras, corner, gradient, diagonal):  # type: ignore[n
                     corner[q, extras[m, b]] += x * Je[m, 0, b] + y * Je[m, 1, b]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _subtract_landmarks(  # type: ignore[no-untyped-def]
     first, last, starts, frames, row_starts, partners, observation_starts, observations, landmarks, coupling,
     extras_coupling, inverses, landmark_gradient, blocks, gradient, with_extras,

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 
+from rigwake._kernels import njit
 from rigwake._types import Array
 
 _SCRATCH = 64
@@ -54,7 +54,7 @@ def build_kernels(project_point: Callable[..., None], unproject_point: Callable[
     """Loops over points around the scalar functions of a lens; compiled on first use, cached on disk."""
     version = _source_version(project_point)
 
-    @njit(cache=True, nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def project(
         points: Array, params: Array, max_angle: float, keep: int, pixels: Array, valid: Any,
         d_point: Array, d_params: Array,
@@ -78,7 +78,7 @@ def build_kernels(project_point: Callable[..., None], unproject_point: Callable[
             d_point[i * keep] = 0.0
             d_params[i * keep] = 0.0
 
-    @njit(cache=True, nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def unproject(pixels: Array, params: Array, max_angle: float, bearings: Array, valid: Any) -> None:
         if version == "":
             return

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._kernels import njit
 from rigwake._types import Array
 from rigwake.errors import UsageError
 from rigwake.views.attitude import LevelAttitude
@@ -272,13 +272,13 @@ def _ranges(
     return inverse, std
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _spread(w: float, wv: float, wvv: float) -> float:
     """Half the weighted squared deviation from the mean, of sums of weights, values and squares."""
     return 0.5 * max(wvv - wv * wv / w, 0.0) if w > 0 else 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def cut_columns(
     cost: Array,
     weight: Array,

@@ -1,0 +1,39 @@
+"""Compiled loops whose copies on disk stay right when several processes compile at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+from uuid import uuid4
+
+import numba
+from numba.core.caching import IndexDataCacheFile
+
+__all__ = ["KernelFile", "njit"]
+
+
+class KernelFile(IndexDataCacheFile):
+    """Files of one kernel, one for each set of argument types, and an index that says which is which.
+
+    numba numbers these files. Two processes that compile for different types at the same time choose the same
+    number; the index may then name the code of one for the types of the other, which crashes or computes wrongly,
+    also in later runs (numba issues 4807 and 10128). Here each file has a name of its own, so that what can get lost
+    is an entry of the index: that kernel is compiled once more.
+    """
+
+    def _data_name(self, number: int) -> str:
+        name: str = super()._data_name(number)
+        return f"{name.removesuffix('.nbc')}.{uuid4().hex[:16]}.nbc"
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator: `numba.njit(cache=True, **options)`, with files that concurrent processes cannot mix up."""
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        kernel = numba.njit(cache=True, **options)(function)
+        files = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+        if isinstance(files, IndexDataCacheFile):  # not where compilation is switched off (NUMBA_DISABLE_JIT)
+            files.__class__ = KernelFile
+        return kernel
+
+    return compiled

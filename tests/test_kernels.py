@@ -1,0 +1,56 @@
+"""Compiled loops on disk: right whoever compiles beside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numba.core.caching import IndexDataCacheFile
+
+from rigwake._kernels import KernelFile, njit
+
+
+def save_at_once(kind: type[IndexDataCacheFile], folder: Path) -> IndexDataCacheFile:
+    """Two processes both read the empty index; the second saves while the first is between index and code."""
+    first, second = (kind(str(folder), "kernel", "stamp") for _ in range(2))
+    save_index, empty = first._save_index, second._load_index()
+
+    def save_index_then_the_other_saves(index: Any) -> None:
+        save_index(index)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(second, "_load_index", lambda: dict(empty))
+            second.save("floats", "code for floats")
+
+    first._save_index = save_index_then_the_other_saves
+    first.save("integers", "code for integers")
+    return second
+
+
+def test_processes_that_compile_at_once_do_not_mix_up_their_code(tmp_path: Path) -> None:
+    files = save_at_once(KernelFile, tmp_path)
+    assert files.load("integers") in (None, "code for integers")
+    assert files.load("floats") in (None, "code for floats")
+    files.save("integers", "code for integers")
+    files.save("floats", "code for floats")
+    assert files.load("floats") == "code for floats"
+    assert files.load("integers") == "code for integers"
+
+
+def test_one_file_for_each_set_of_argument_types_of_a_kernel() -> None:
+    @njit()
+    def doubled(value: Any) -> Any:
+        return 2 * value
+
+    files = doubled._cache._cache_file
+    assert isinstance(files, KernelFile)
+    assert doubled(3) == 6
+    np.testing.assert_allclose(doubled(np.arange(3.0)), [0, 2, 4])
+    assert len(set(files._load_index().values())) == 2
+
+
+def test_every_kernel_of_the_package_is_compiled_so() -> None:
+    sources = (Path(__file__).parent.parent / "src" / "rigwake").rglob("*.py")
+    wrong = [p.name for p in sources if p.name != "_kernels.py" and "cache=True" in p.read_text()]
+    assert not wrong
