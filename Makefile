@@ -16,10 +16,10 @@ demo: $(STAMP)
 	$(BIN)/rigwake demo -o demo
 
 test-fast: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow"
+	$(BIN)/python -m pytest -n 2 -m "not slow"
 
 test: test-fast
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m slow
+	$(BIN)/python -m pytest -n 2 -m slow
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -36,7 +36,7 @@ mutants: $(STAMP)
 # fast suite over the main job; the table by package comes last
 coverage: $(STAMP)
 	rm -rf build/coverage
-	$(BIN)/coverage run -m pytest -n 2 --dist loadgroup -m "not slow"
+	$(BIN)/coverage run -m pytest -n 2 -m "not slow"
 	$(BIN)/coverage combine --quiet
 	$(BIN)/python tests/coverage_table.py
 

@@ -1,9 +1,25 @@
 """Shared by all tests: where the real recordings are."""
 
+from __future__ import annotations
+
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# a machine with other work is no fault of the code: wall time judges nothing
+settings.register_profile("rigwake", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("rigwake")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Which worker runs what, with -n 2."""
+    from work_units import FileScheduling
+
+    return FileScheduling(config, log)
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ POINTS = np.random.default_rng(0).normal(size=(30, 3)) * [20, 30, 1]
 
 
 @given(transforms(), st.floats(0.01, 100))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_similarity_is_recovered(target_from_source: SE3, scale: float) -> None:
     target = target_from_source * (scale * POINTS)
     found = align_points(POINTS, target, "sim3")

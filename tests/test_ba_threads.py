@@ -40,7 +40,7 @@ def test_threads_change_nothing(imu: bool, monkeypatch: pytest.MonkeyPatch) -> N
     assert np.allclose(alone, solved(problem, 1, np.inf, monkeypatch), rtol=0, atol=1e-7)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.integers(0, 100), min_size=1, max_size=60), st.integers(1, 200))
 def test_ranges_cover_everything_once_and_are_worth_it(costs: list[int], least: int) -> None:
     bounds = parallel.ranges(np.array(costs), least)
@@ -71,7 +71,7 @@ def test_an_error_on_a_thread_reaches_the_caller() -> None:
         parallel.over_ranges(np.arange(4), lambda first, last: first // (first - 1))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.integers(-2, 2), min_size=1, max_size=40), st.integers(1, 2), st.integers(1, 12))
 def test_ranges_of_frames_share_no_state(jitter: list[int], neighbours: int, parts: int) -> None:
     first = np.clip(np.arange(len(jitter)) // 3 + jitter, 0, None)

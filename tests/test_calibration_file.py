@@ -40,7 +40,7 @@ def vertical_lost(
 
 
 @given(transforms())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_transforms_survive_the_file(rig_from_cam: SE3) -> None:
     camera = replace(calibrated(), rig_from_cam=rig_from_cam)
     text = yaml.safe_dump(calibration_to_dict(Calibration("imu", {"front": camera})), sort_keys=False)

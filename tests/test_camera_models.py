@@ -32,7 +32,7 @@ def test_every_model_is_tested() -> None:
 
 @every_lens
 @given(fraction=fractions, phi=azimuths, depth=st.floats(0.01, 1e4))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_ray_comes_back_from_its_pixel(camera: Lens, fraction: float, phi: float, depth: float) -> None:
     theta = fraction * reach_of(camera)
     ray = np.array([[np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]])

@@ -64,7 +64,7 @@ def test_what_is_written_is_read_back(tmp_path: Path, name: str, file: str) -> N
 
 
 @given(transforms(), transforms())
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_any_rotation_survives_every_text_format(tmp_path_factory, first: SE3, second: SE3) -> None:
     folder = tmp_path_factory.mktemp("exports")
     rig = Calibration("imu", {"a": camera("a", first, PINHOLE), "b": camera("b", second, PINHOLE)})
@@ -82,7 +82,7 @@ def test_any_rotation_survives_every_text_format(tmp_path_factory, first: SE3, s
     st.sampled_from([-np.pi / 2, np.pi / 2, 0.3]) | st.floats(-1.57, 1.57),
     st.floats(-3.1, 3.1),
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_yaw_pitch_roll_composes_also_at_gimbal_lock(yaw: float, pitch: float, roll: float) -> None:
     rotation = rotation_from_yaw_pitch_roll([yaw, pitch, roll])
     np.testing.assert_allclose(rotation_from_yaw_pitch_roll(yaw_pitch_roll(rotation)), rotation, atol=1e-12)

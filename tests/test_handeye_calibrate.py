@@ -49,7 +49,7 @@ def errors(X: SE3, estimate: SE3) -> np.ndarray:
     noise=st.sampled_from([None, "increments", "poses"]),
     scale=st.sampled_from([None, 0.01, 7.0]),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_exact_without_noise(mounting, seed, noise, scale):
     rng = np.random.default_rng(seed)
     steps = rng.normal(size=(40, 6)) * np.repeat([0.3, 1.0], 3)

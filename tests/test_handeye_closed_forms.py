@@ -15,7 +15,7 @@ SOLVERS = {**CLOSED_FORMS, "seed": linear_handeye}
 
 @pytest.mark.parametrize("name", SOLVERS)
 @given(mounting=transforms(), seed=st.integers(0, 2**31))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_exact_without_noise(name, mounting, seed):
     rng = np.random.default_rng(seed)
     B = SE3.exp(rng.normal(size=(20, 6)) * np.repeat([0.5, 1.0], 3))

@@ -22,7 +22,7 @@ TIMES = np.arange(40) * 0.1
 
 
 @given(a=transforms(), b=transforms(), scale=st.floats(0.1, 10))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_motions_logarithms_and_retractions_agree_with_se3(a, b, scale):
     poses = SE3(np.stack([a.rotation, b.rotation]), np.stack([a.translation, b.translation]) * scale)
     motion = SE3(*kernels.motions(poses.rotation, poses.translation, np.arange(1), 1))

@@ -24,7 +24,7 @@ def residuals(fraction, rotation_std, translation_std, arm, count, rng):
     return np.hstack([reference + own, moved])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     fraction=st.floats(0.05, 0.95),
     length=st.floats(1.0, 12.0),

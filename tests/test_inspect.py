@@ -76,7 +76,7 @@ def test_levelled_rotations_keep_the_vertical_and_turn_as_the_boat_does() -> Non
 
 
 @given(offset_ms=st.integers(-400, 400), seed=st.integers(0, 2**20))
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 def test_camera_clock_is_recovered_within_its_sigmas(offset_ms: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     imu = simulated_imu()
@@ -127,7 +127,7 @@ def test_gnss_clock_is_recovered_within_its_sigmas(offset_s: float) -> None:
     period_ms=st.integers(5, 200),
     lost=st.lists(st.integers(1, 98), max_size=10, unique=True),
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_timing_counts_what_is_missing(period_ms: int, lost: list[int]) -> None:
     stamps = START_NS + np.arange(100) * period_ms * 10**6
     measured = timing(np.delete(stamps, lost))

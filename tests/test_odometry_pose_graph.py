@@ -26,7 +26,7 @@ def edges_between(first, second, measured, robust=False, std=0.01) -> Edges:
     return Edges(first, second, measured, np.full((count, 7), std), np.full(count, robust))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 10_000))
 def test_group_laws(seed):
     a, b = some(seed, 5), some(seed + 1, 5)
@@ -37,7 +37,7 @@ def test_group_laws(seed):
     np.testing.assert_allclose((a.inverse() * a).log(), 0, atol=1e-9)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 10_000))
 def test_derivatives_are_those_of_finite_differences(seed):
     nodes, step = some(seed, 2), 1e-6

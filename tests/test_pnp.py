@@ -23,7 +23,7 @@ def resection(seed: int, n: int = 100, noise: float = 0.0, outliers: float = 0.0
     return world_from_cam, world_from_cam * points_cam, bearings, wrong
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 10_000))
 def test_recovers_pose_among_outliers_all_around_the_camera(seed):
     truth, points, bearings, wrong = resection(seed, noise=1e-3, outliers=0.4)
@@ -41,7 +41,7 @@ def test_recovers_pose_among_outliers_all_around_the_camera(seed):
     assert found.inliers[wrong].mean() < 0.05
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 10_000))
 def test_gradient_matches_finite_differences_of_the_cost(seed):
     truth, points, bearings, _ = resection(seed, n=30, noise=5e-3)

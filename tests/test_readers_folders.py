@@ -185,7 +185,7 @@ def test_nmea_log_over_midnight(tmp_path: Path) -> None:
     height=st.floats(-100, 5000),
     offset=st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(-500, 500)),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_geodesy_round_trip(
     latitude: float, longitude: float, height: float, offset: tuple[float, float, float]
 ) -> None:
@@ -197,7 +197,7 @@ def test_geodesy_round_trip(
 
 
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=30))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_time_order_sorts_and_says_so(stamps: list[int]) -> None:
     order, findings = time_order("imu", np.array(stamps, dtype=np.int64))
     assert np.array(stamps)[order].tolist() == sorted(set(stamps))

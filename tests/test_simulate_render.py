@@ -52,7 +52,7 @@ def test_textures_keep_their_mean_colour_at_any_distance() -> None:
         assert atlas.sizes[number, -1] == 1
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     east=st.floats(-300, 300),
     north=st.floats(-300, 300),
@@ -74,7 +74,7 @@ def test_rays_end_on_the_surface_of_the_sea(
     assert at[2] == pytest.approx(height[long_waves].sum(), abs=0.02)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 10_000),
     spread_m=st.sampled_from([4.0, 40.0, 900.0]),

@@ -225,7 +225,7 @@ def test_a_perfect_receiver_is_exact_and_outages_are_silent(thesis: Scenario) ->
     np.testing.assert_allclose(gnss.position_enu, antenna, atol=1e-12)
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(seed=st.integers(0, 10_000), offset_ms=st.floats(-80, 80), readout_ms=st.sampled_from([0.0, 25.0]))
 def test_exact_observations_are_projections_of_the_truth(
     seed: int, offset_ms: float, readout_ms: float

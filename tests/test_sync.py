@@ -12,7 +12,7 @@ from rigwake.sync import angular_speed, estimate_time_offset
 
 
 @given(offset=st.floats(-5000, 5000), rate_hz=st.floats(8, 40), start=st.floats(0, 15))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_offset_of_any_size_to_a_fraction_of_a_sample(offset, rate_hz, start):
     times = np.arange(1200) * 0.05
     own = start + np.arange(0, 40, 1 / rate_hz)

@@ -40,7 +40,7 @@ def test_spline_coefficients_agree_with_scipy():
 
 
 @given(st.floats(2, 50), st.floats(2, 35))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_sampling_agrees_with_scipy_and_with_its_own_gradient(x, y):
     image = np.random.default_rng(1).integers(0, 256, (40, 57)).astype(np.uint8)
     coefficients = spline_coefficients(image).astype(float)
@@ -69,7 +69,7 @@ small = st.floats(-0.08, 0.08)
     st.floats(-15, 15),
     st.tuples(st.floats(-0.006, 0.006), st.floats(-0.006, 0.006)),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_recovers_position_and_warp_whatever_the_light_does(bend, shift, gain, bias, falloff):
     centres = np.array([[40.0, 40.0], [70.0, 55.0], [55.0, 30.0]])
     first = waves(GRID_X, GRID_Y)
@@ -133,7 +133,7 @@ def test_a_patch_that_left_the_image_or_went_dark_is_not_found():
 
 
 @given(st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_rotation_warp_is_the_derivative_of_where_pixels_go(turn):
     model = fisheye(640, 480)
     pixels = np.array([[330.0, 250.0], [200, 150], [450, 330]])
@@ -160,7 +160,7 @@ def test_rotation_warp_is_the_derivative_of_where_pixels_go(turn):
 
 
 @given(st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)), st.integers(0, 100))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_dominant_rotation_outvotes_a_third_that_moves_otherwise(turn, seed):
     rng = np.random.default_rng(seed)
     before = rng.normal(size=(60, 3))

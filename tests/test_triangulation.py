@@ -42,7 +42,7 @@ def scene(seed: int, n: int = 60) -> tuple[SE3, np.ndarray, np.ndarray, np.ndarr
     return second_from_first, points, unit(points), unit(second_from_first * points)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 10_000))
 def test_two_view_methods_are_exact_behind_the_image_plane_too(seed):
     second_from_first, points, first, second = scene(seed)

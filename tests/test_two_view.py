@@ -55,7 +55,7 @@ def test_recovers_pose_among_outliers_all_around_the_camera(solver, seed):
     assert found.inliers[wrong].mean() < 0.1
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_known_rotation_recovers_the_direction_with_its_sign(seed):
     truth, first, second, wrong = two_views(seed, noise=3e-4, outliers=0.5)
@@ -66,7 +66,7 @@ def test_known_rotation_recovers_the_direction_with_its_sign(seed):
     assert found.inliers[~wrong].mean() > 0.85
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_true_pairs_obey_the_constraint_and_meet_in_front(seed):
     truth, first, second, _ = two_views(seed)
@@ -95,7 +95,7 @@ def test_refinement_reaches_the_noise_limit_from_a_rough_start():
     assert direction_deg < 0.15
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(rotation_vectors(max_angle=2.0), st.integers(0, 1000))
 def test_pure_rotation_is_found_and_shows_no_parallax(rotation_vector, seed):
     _, first, _, _ = two_views(seed)

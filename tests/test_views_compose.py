@@ -158,7 +158,7 @@ def test_gains_brighten_and_saturate(scene) -> None:
 
 
 @given(st.integers(1, 5), st.floats(0.1, 20))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_weights_sum_to_one_or_zero(cameras: int, feather_deg: float) -> None:
     quality = np.random.default_rng(cameras).random((cameras, 9, 7)).astype(np.float32)
     quality[:, 0] = 0

@@ -34,7 +34,7 @@ ANGLES = st.floats(-20, 20)
 
 
 @given(ANGLES, ANGLES)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_level_frame_has_z_up_and_x_ahead(roll: float, pitch: float) -> None:
     stand = attitude(roll, pitch)
     R = stand.level_from_rig
@@ -54,7 +54,7 @@ def test_azimuth_is_positive_to_starboard() -> None:
 
 
 @given(st.floats(-170, 170), st.floats(-44, 29))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_strip_pixels_and_directions_are_inverse(azimuth_deg: float, elevation_deg: float) -> None:
     grid = StripGrid()
     column, row = grid.pixels(level_directions(np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg)))
