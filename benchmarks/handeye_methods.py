@@ -82,7 +82,7 @@ def solvers(kind: str) -> dict[str, Solver]:
     if hasattr(cv2, "calibrateHandEye"):
         for name in ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS"):
             found[f"cv2 {name}"] = opencv(getattr(cv2, f"CALIB_HAND_EYE_{name}"))
-    found["seed"] = thesis_handeye
+    found["thesis"] = thesis_handeye
     found["ml, noise estimated"] = ml()
     found["ml, kind of noise told"] = ml(noise="poses" if kind == "additive" else "increments")
     found["ml, noise and clock estimated"] = ml(time_offset=True)

@@ -131,22 +131,22 @@ class Row:
     kind: str
     rotation_std: float
     translation_std: float
-    seed_rmse: np.ndarray
+    thesis_rmse: np.ndarray
     ml_rmse: np.ndarray
     bound: np.ndarray
     nees: float
-    seed_median_worst: float
+    thesis_median_worst: float
     ml_median_worst: float
 
 
 def study(kind: str, rotation_std: float, translation_std: float, draws: int) -> Row:
     options = options_for(kind, rotation_std, translation_std)
-    seeds, ours, nees = [], [], []
+    baseline, ours, nees = [], [], []
     for draw in range(draws):
         rng = np.random.default_rng(draw)
         front = noisy(boat() * FRONT, kind, rotation_std, translation_std, rng)
         port = noisy(boat() * PORT, kind, rotation_std, translation_std, rng)
-        seeds.append(in_boat_axes(TRUTH.local(thesis_handeye(front, port))))
+        baseline.append(in_boat_axes(TRUTH.local(thesis_handeye(front, port))))
         result = calibrate_handeye(trajectory("front", front), [trajectory("port", port)], options)
         d = TRUTH.local(result.ref_from_members["port"])
         ours.append(in_boat_axes(d))
@@ -165,11 +165,11 @@ def study(kind: str, rotation_std: float, translation_std: float, draws: int) ->
         kind,
         rotation_std,
         translation_std,
-        rmse(seeds),
+        rmse(baseline),
         rmse(ours),
         bound,
         float(np.mean(nees)),
-        worst(seeds),
+        worst(baseline),
         worst(ours),
     )
 
@@ -182,7 +182,7 @@ def markdown(rows: list[Row], draws: int) -> str:
         f"{6 - spread:.2f} .. {6 + spread:.2f} (rows with exact rotations: {6 - spread * np.sqrt(2):.2f} .. "
         f"{6 + spread * np.sqrt(2):.2f}). A dash: exact rotations, no bound.",
         "",
-        "| noise | stdR | stdT m | printed by the original | seed | ml | bound, worst axis RMSE m "
+        "| noise | stdR | stdT m | printed by the original | thesis | ml | bound, worst axis RMSE m "
         "| ml RMSE / bound | NEES |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
@@ -194,7 +194,7 @@ def markdown(rows: list[Row], draws: int) -> str:
         shown = " ".join("–" if np.isnan(x) else f"{x:.2f}" for x in ratios)
         lines.append(
             f"| {row.kind} | {row.rotation_std:g} | {row.translation_std:g} | "
-            f"{'' if printed is None else f'{printed:g} m'} | {_metres(row.seed_median_worst)} | "
+            f"{'' if printed is None else f'{printed:g} m'} | {_metres(row.thesis_median_worst)} | "
             f"{_metres(row.ml_median_worst)} | {_metres(row.bound[3:].max())} | {shown} | {row.nees:.2f} |"
         )
     return "\n".join(lines) + "\n"
@@ -216,7 +216,7 @@ def plot(rows: list[Row], path: Path) -> None:
     for panel, kind in zip(panels, ("additive", "cumulative"), strict=True):
         chosen = [row for row in rows if row.kind == kind]
         at = np.arange(len(chosen))
-        panel.semilogy(at, [r.seed_rmse[3:].max() for r in chosen], "s", color="tab:red", label="seed")
+        panel.semilogy(at, [r.thesis_rmse[3:].max() for r in chosen], "s", color="tab:red", label="thesis")
         panel.semilogy(at, [r.ml_rmse[3:].max() for r in chosen], "o", color="tab:blue", label="ml")
         panel.semilogy(at, [r.bound[3:].max() for r in chosen], "k_", markersize=18, label="Cramér-Rao bound")
         labels = [f"{r.rotation_std:g}\n{r.translation_std:g}" for r in chosen]

@@ -55,7 +55,7 @@ USED = [
     ("inspect {images} --json - --topic camera.front=/a --topics {topics}", 0, '"verdict"'),
     ("inspect {images} --html {here}/page.html", 0, "Not enough to calibrate"),
     (
-        "odometry {images} -o {here}/o1 --camera all --front-end klt --method seed --no-imu --no-gnss --no-attitude "
+        "odometry {images} -o {here}/o1 --camera all --front-end klt --method thesis --no-imu --no-gnss --no-attitude "
         "--no-hull --no-horizon --loops --no-refine-lens --mask {mask} --seed 3 --jobs 1 --allow-partial "
         "--topic camera.front=/a --topics {topics} --json {here}/o.json",
         1,
@@ -78,7 +78,7 @@ USED = [
         "next:",
     ),
     (
-        "handeye {rig_tum} {port_tum} {starboard_tum} --method seed --no-time-offset --scale --json -",
+        "handeye {rig_tum} {port_tum} {starboard_tum} --method thesis --no-time-offset --scale --json -",
         0,
         '"members"',
     ),

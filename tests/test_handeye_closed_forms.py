@@ -10,7 +10,7 @@ from geometry_strategies import transforms
 from rigwake.geometry.se3 import SE3
 from rigwake.handeye.initial_mounting import linear_handeye
 
-SOLVERS = {**CLOSED_FORMS, "seed": linear_handeye}
+SOLVERS = {**CLOSED_FORMS, "thesis": linear_handeye}
 
 
 @pytest.mark.parametrize("name", SOLVERS)

@@ -167,7 +167,7 @@ def handeye(
     reference: FilePath | Trajectory,
     *others: FilePath | Trajectory,
     out: FilePath | None = None,
-    method: Literal["ml", "seed"] = "ml",
+    method: Literal["ml", "thesis"] = "ml",
     noise: Literal["auto", "estimated", "increments", "poses"] = "auto",
     time_offset: bool = True,
     scale: bool = False,
@@ -182,7 +182,7 @@ def handeye(
     from rigwake.pipeline.handeye_run import run_handeye
 
     options = HandeyeOptions(
-        method="ml" if method == "ml" else "thesis",
+        method=method,
         noise=None if noise == "auto" else noise,
         time_offset=time_offset,
         scale=scale,

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rigwake.handeye.handeye_problem import HandeyeResult
     from rigwake.trajectory import Trajectory
 
-_METHODS = ("ml", "thesis", "seed")
+_METHODS = ("ml", "thesis")
 _NOISES = ("auto", "estimated", "increments", "poses")
 
 
@@ -34,7 +34,7 @@ def command(
     method: Annotated[
         str,
         typer.Option(
-            help="`ml`: maximum likelihood; `seed`: the linear baseline.",
+            help="`ml`: maximum likelihood; `thesis`: the linear baseline.",
             autocompletion=completed_from(_METHODS),
         ),
     ] = "ml",
@@ -89,7 +89,7 @@ def command(
     meanings = [_meaning(one, columns or (), frame or ()) for one in inputs]
     trajectories = [_read(one, *meaning) for one, meaning in zip(inputs, meanings, strict=True)]
     options = HandeyeOptions(
-        method="thesis" if method in ("thesis", "seed") else "ml",
+        method="ml" if method == "ml" else "thesis",
         noise=None if noise == "auto" else noise,  # type: ignore[arg-type]
         time_offset=time_offset,
         scale=scale,

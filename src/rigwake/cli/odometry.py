@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rigwake.plausibility.values import SensorCheck
     from rigwake.recording import Recording
 
-_METHODS = ("adjusted", "seed")
+_METHODS = ("adjusted", "thesis")
 _FRONT_ENDS = ("klt", "sift", "fast-brief", "orb")
 
 
@@ -52,7 +52,7 @@ def command(
     method: Annotated[
         str,
         typer.Option(
-            help="adjusted, or the frame-to-frame baseline: seed.",
+            help="adjusted, or the frame-to-frame baseline: thesis.",
             autocompletion=completed_from(_METHODS),
         ),
     ] = "adjusted",
@@ -127,7 +127,7 @@ def command(
         method="adjusted" if method == "adjusted" else "thesis",
         tracking=TrackingOptions(front_end=cast(FrontEndName, front_end)),
         odometry=OdometryOptions(seed=seed),
-        seed=ThesisOptions(seed=seed),
+        thesis=ThesisOptions(seed=seed),
         hull=hull,
         horizon="off" if no_horizon else horizon_choice(horizon),
         mask_file=mask,

@@ -43,7 +43,7 @@ class NoiseLevel:
 class HandeyeOptions:
     """How to calibrate.
 
-    method: `ml`, or the baseline `seed`.
+    method: `ml`, or the baseline `thesis`.
     noise: errors independent from increment to increment, from pose to pose, or `estimated`: drift and jitter
         in shares learnt from the residuals, or poses where these do not drift (see `joint_calibration`).
         None: as the covariances of the trajectories say, else `estimated`.

@@ -36,7 +36,7 @@ Method = Literal["adjusted", "thesis"]
 class CameraOdometryOptions:
     """What to do for one camera.
 
-    method: `adjusted` (keyframes, bundle adjustment, smoother) or `seed` (the frame-to-frame baseline).
+    method: `adjusted` (keyframes, bundle adjustment, smoother) or `thesis` (the frame-to-frame baseline).
     hull: look for the own boat in view. horizon: whether what lies below the horizon is left out (needs an IMU).
     mask_file: picture of the camera's size, white where it may be used.
     loops: recognise places seen before and join their tracks; without it this is done only where the odometry broke.
@@ -46,7 +46,7 @@ class CameraOdometryOptions:
     method: Method = "adjusted"
     tracking: TrackingOptions = field(default_factory=TrackingOptions)
     odometry: OdometryOptions = field(default_factory=OdometryOptions)
-    seed: ThesisOptions = field(default_factory=ThesisOptions)
+    thesis: ThesisOptions = field(default_factory=ThesisOptions)
     hull: bool = True
     horizon: HorizonChoice = "auto"
     mask_file: Path | None = None
@@ -96,7 +96,7 @@ def run_camera(
             f"camera {stream.name} has no intrinsics.", remedy="Calibrate one with `rigwake intrinsics`."
         )
     run = _OdometryRun(stream, imu, gnss, attitude, options, progress or (lambda stage, done, total: None))
-    return run.seed() if options.method == "thesis" else run.adjusted()
+    return run.thesis() if options.method == "thesis" else run.adjusted()
 
 
 class _OdometryRun:
@@ -140,10 +140,10 @@ class _OdometryRun:
         self.stage_started = time.perf_counter()
         return found.mask, found.tracks, found.rotations
 
-    def seed(self) -> CameraOdometry:
+    def thesis(self) -> CameraOdometry:
         """The baseline: frame to frame, no map."""
         mask, tracks, rotations = self._measured()
-        trajectory = estimate_thesis(tracks, self.model, self.options.seed, rotations=rotations)
+        trajectory = estimate_thesis(tracks, self.model, self.options.thesis, rotations=rotations)
         self._done("odometry")
         return CameraOdometry(trajectory, "none", tracks, mask, notes=tuple(self.notes), seconds=self.seconds)
 
