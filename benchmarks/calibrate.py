@@ -1,10 +1,12 @@
 """The rig of recordings with known truth, by method: thesis pipeline, hand-eye only, rig bundle adjustment
 without and with cross-camera association.
 
-    python benchmarks/calibrate.py [--peers] [RECORDING TRUTH]...
+    python benchmarks/calibrate.py [--peers] [RECORDING TRUTH | PRESET]...
 
-Without arguments: `harbour_a` in RIGWAKE_DATA, or in ../shared/data beside the project. --peers: pycolmap too, see
-`colmap_rig.py` (some ten minutes). Errors are those of the worst pair of cameras, which needs no common reference.
+Without arguments: `harbour_a` and `kitti_03_split` in RIGWAKE_DATA, or in ../shared/data beside the project, and the
+presets `demo` and `thesis_lively`, which are rendered first. --peers: pycolmap too, see `colmap_rig.py` (some ten
+minutes). Errors are those of the worst camera in the frame of the reference, and of the worst pair, which needs no
+common reference; NEES is that of the best and of the worst camera, and 6 is expected.
 Seconds and peak memory are of the whole process and its children, from images to calibration; `hand-eye only` stops
 before the bundle adjustment, so it has no figures of its own.
 """
@@ -16,6 +18,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from rigwake.api import simulate
 from rigwake.calibration import Calibration, load_calibration
 from rigwake.config import load_config
 from rigwake.errors import RigwakeError
@@ -31,6 +34,11 @@ from rigwake.readers.truth_files import read_true_rig, rig_in_frame
 from rigwake.rig import Rig
 from rigwake.tracks import load_tracks
 
+METHODS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("as it comes", ()),
+    ("lenses held", ("intrinsics=fixed",)),
+    ("no cross-camera association", ("adjustment.cross_camera=false",)),
+)
 PEER_RATE_HZ = 1.0  # all pairs of images are matched: twice the rate takes four times as long
 DATA = Path(os.environ.get("RIGWAKE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
@@ -48,15 +56,23 @@ def peak_gb() -> float:
 
 def row(name: str, method: str, found: Calibration | str, truth: Rig, used: str) -> None:
     if isinstance(found, str):
-        print(f"| {name} | {method} | – | – | {used} {found} |", flush=True)
+        print(f"| {name} | {method} | – | – | – | – | – | {used} {found} |", flush=True)
         return
     errors = evaluate_calibration(found, rig_in_frame(truth, found.reference))
-    turn = max(pair.rotation_error_deg for pair in errors.pairs)
-    shift = max(pair.translation_error_m for pair in errors.pairs)
-    print(f"| {name} | {method} | {turn:.3f} | {100 * shift:.1f} | {used} |", flush=True)
+    turn = max(camera.rotation_error_deg for camera in errors.cameras.values())
+    shift = max(camera.translation_error_norm_m for camera in errors.cameras.values())
+    pair_turn = max(pair.rotation_error_deg for pair in errors.pairs)
+    pair_shift = max(pair.translation_error_m for pair in errors.pairs)
+    known = [camera.nees for camera in errors.cameras.values() if camera.nees is not None]
+    nees = f"{min(known):.1f}-{max(known):.1f}" if known else "–"
+    print(
+        f"| {name} | {method} | {turn:.4f} | {1000 * shift:.1f} | {pair_turn:.4f} | {1000 * pair_shift:.1f} | "
+        f"{nees} | {used} |",
+        flush=True,
+    )
 
 
-def seed_pipeline(recording: Path, out: Path) -> Calibration | str:
+def thesis_pipeline(recording: Path, out: Path) -> Calibration | str:
     """Frame-to-frame odometry of every camera's tracks, put into metres by GNSS, then the thesis hand-eye."""
     opened = open_recording(recording)
     gnss = next(iter(opened.gnss.values()), None)
@@ -86,10 +102,7 @@ def compare(recording: Path, truth_file: Path, peers: bool) -> None:
     name, truth = recording.stem, read_true_rig(truth_file)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
-        for method, settings in (
-            ("ours", ()),
-            ("ours, no cross-camera association", ("adjustment.cross_camera=false",)),
-        ):
+        for method, settings in METHODS:
             resumed = bool(settings)
             wall, cpu = time.perf_counter(), cpu_s()
             try:
@@ -101,9 +114,9 @@ def compare(recording: Path, truth_file: Path, peers: bool) -> None:
             wall, cpu = time.perf_counter() - wall, cpu_s() - cpu
             tracked = " after tracking" if resumed else f", peak {peak_gb():.2f} GB"
             row(name, method, found, truth, f"{cpu:.0f} CPU s, {wall:.0f} s{tracked}")
-        row(name, "ours, hand-eye only", load_calibration(out / "initial_rig.yaml"), truth, "")
+        row(name, "hand-eye only", load_calibration(out / "initial_rig.yaml"), truth, "")
         cpu = cpu_s()
-        found = seed_pipeline(recording, out)
+        found = thesis_pipeline(recording, out)
         row(name, "thesis pipeline", found, truth, f"{cpu_s() - cpu:.0f} CPU s after tracking")
     if peers:
         wall, cpu = time.perf_counter(), cpu_s()
@@ -112,15 +125,30 @@ def compare(recording: Path, truth_file: Path, peers: bool) -> None:
         row(name, f"pycolmap, {PEER_RATE_HZ:g} Hz", found, truth, f"{cpu:.0f} CPU s, {wall:.0f} s")
 
 
+def compare_preset(preset: str, peers: bool) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        recording = Path(folder) / f"{preset}.bag"
+        simulate(preset, recording, jobs=2)
+        compare(recording, Path(folder) / f"{preset}_truth" / "truth.yaml", peers)
+
+
 def main() -> None:
     given = [argument for argument in sys.argv[1:] if argument != "--peers"]
-    paths = [Path(argument) for argument in given]
-    pairs = list(zip(paths[::2], paths[1::2], strict=True)) or [
-        (DATA / "harbour_a" / "harbour_a.bag", DATA / "harbour_a" / "truth.yaml")
-    ]
-    print("| recording | method | rotation deg | translation cm | used |\n" + "|---" * 5 + "|")
-    for recording, truth in pairs:
-        compare(recording, truth, "--peers" in sys.argv)
+    if not given:
+        for name, file in (("harbour_a", "harbour_a.bag"), ("kitti_03_split", "")):
+            given += [str(DATA / name / file), str(DATA / name / "truth.yaml")]
+        given += ["demo", "thesis_lively"]
+    print(
+        "| recording | method | camera deg | camera mm | pair deg | pair mm | NEES | used |\n"
+        + "|---" * 8
+        + "|"
+    )
+    while given:
+        first = given.pop(0)
+        if Path(first).exists():
+            compare(Path(first), Path(given.pop(0)), "--peers" in sys.argv)
+        else:
+            compare_preset(first, "--peers" in sys.argv)
 
 
 if __name__ == "__main__":
