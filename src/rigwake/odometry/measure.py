@@ -111,7 +111,9 @@ def frames_to_follow(stream: CameraStream, rotations: Array, rate_hz: float) -> 
     assert stream.model is not None
     most = _MOST_TURNED_PX / axis_focal_px(stream.model)
     turned = np.linalg.norm(so3.log(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]), axis=1)
-    return _spaced(stream.timestamps_ns, np.concatenate([[0.0], np.cumsum(turned)]), round(1e9 / rate_hz), most)
+    return _spaced(
+        stream.timestamps_ns, np.concatenate([[0.0], np.cumsum(turned)]), round(1e9 / rate_hz), most
+    )
 
 
 def _spaced(stamps: Stamps, turned: Array, most_ns: int, most_turned: float) -> Indices:
