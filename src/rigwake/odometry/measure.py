@@ -5,17 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from rigwake._progress import CountProgress
-from rigwake._types import Array, Indices, Stamps
-from rigwake.cameras.models.lens import axis_focal_px
+from rigwake._types import Array
 from rigwake.errors import EstimationError, UnobservableError
-from rigwake.excerpt import ChosenFrames
-from rigwake.geometry import so3
 from rigwake.odometry.below_horizon import HorizonChoice, look_below_horizon
 from rigwake.odometry.gravity_alignment import up_in_camera
 from rigwake.odometry.gyro import GyroAlignment, align_gyro, camera_rotations
@@ -27,8 +24,6 @@ from rigwake.tracking.self_mask import find_self_mask
 from rigwake.tracking.tracking_options import TrackingOptions
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
-
-_MOST_TURNED_PX = 25.0  # from one followed frame to the next: the search for corners still reaches that far
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,15 +48,13 @@ def measure_camera(
     horizon: HorizonChoice = "auto",
     mask_file: Path | None = None,
     turns: Trajectory | None = None,
-    rate_hz: float | None = None,
     track: Callable[..., Tracks] = track_camera,
 ) -> CameraMeasurement:
     """Mask, gyro and tracks of a camera; the gyro tells where the horizon is, and below it nothing is tracked.
 
     hull: look for the own boat in view. horizon: leave out what lies below it (auto: where it is water). mask_file: a
     picture of the camera's size, white where it may be used. turns: what `visual_rotations` finds, if that is known.
-    rate_hz: follow so many frames per second, and more only where the gyroscope tells that the camera turns far; all
-    by default, and without a gyroscope. track: `track_camera`, or what does the same in parts.
+    track: `track_camera`, or what does the same in parts.
     A hull that is not found and a gyro that does not fit are noted and done without. Raises EstimationError where
     nothing can be tracked.
     """
@@ -83,12 +76,6 @@ def measure_camera(
             below = look_below_horizon(stream, up_cam, mask.usable)
             notes.append(below.words)
             up_cam = None if below.is_rigid else up_cam
-    if rate_hz is not None and gyro is not None and imu is not None:
-        rows = frames_to_follow(stream, camera_rotations(imu, gyro, stream.timestamps_ns), rate_hz)
-        up_cam = None if up_cam is None else up_cam[rows]
-        stream = replace(
-            stream, timestamps_ns=stream.timestamps_ns[rows], source=ChosenFrames(stream.source, rows)
-        )
     total = max(len(stream), 1)
     tracks = track(
         stream, tracking, mask, up_cam=up_cam, progress=lambda done: progress("tracking", done, total)
@@ -100,34 +87,6 @@ def measure_camera(
     stages = ("masks and gyroscope", "tracking")
     seconds = {stage: marks[k + 1] - marks[k] for k, stage in enumerate(stages)}
     return CameraMeasurement(mask, tracks, rotations, tuple(notes), seconds)
-
-
-def frames_to_follow(stream: CameraStream, rotations: Array, rate_hz: float) -> Indices:
-    """Rows of frames that are no further apart than `1 / rate_hz` seconds, nor than a turn which moves the picture by
-    more than corners are searched for; where the stream has no frame that near, its next one.
-
-    rotations: (F, 3, 3) `world_from_cam` of the stream's frames.
-    """
-    assert stream.model is not None
-    most = _MOST_TURNED_PX / axis_focal_px(stream.model)
-    turned = np.linalg.norm(so3.log(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]), axis=1)
-    return _spaced(
-        stream.timestamps_ns, np.concatenate([[0.0], np.cumsum(turned)]), round(1e9 / rate_hz), most
-    )
-
-
-def _spaced(stamps: Stamps, turned: Array, most_ns: int, most_turned: float) -> Indices:
-    """Every time the last row that is within both limits of the one before it, or the next row."""
-    rows = [0] if len(stamps) else []
-    while rows and rows[-1] < len(stamps) - 1:
-        at = rows[-1]
-        # stamps jitter: a frame that comes a little late still belongs to its interval
-        reach = min(
-            int(np.searchsorted(stamps, stamps[at] + round(1.02 * most_ns), side="right")),
-            int(np.searchsorted(turned, turned[at] + most_turned, side="right")),
-        )
-        rows.append(max(at + 1, reach - 1))
-    return np.array(rows, dtype=np.int64)
 
 
 def _mask(stream: CameraStream, hull: bool, mask_file: Path | None, notes: list[str]) -> CameraMask:

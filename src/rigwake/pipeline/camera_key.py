@@ -52,7 +52,6 @@ def camera_key(
         _values(imu),
         config.model_dump(mode="json", exclude=_LATER),
         odometry,
-        config.adjustment.state_rate_hz,  # tells how many frames are followed
         # what another version left may lack what this one reads
         [__version__, *(part.name for part in fields(CameraOutcome))],
     )

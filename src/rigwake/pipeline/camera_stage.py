@@ -146,7 +146,6 @@ def _process(
         hull=config.find_self_mask,
         horizon=config.horizon if horizon else "off",
         turns=job.turns,
-        rate_hz=config.adjustment.state_rate_hz,  # the bundle adjustment looks at no others
         track=track_camera
         if config.stretch_s is None
         else partial(track_in_stretches, stretch_s=config.stretch_s, map_stretches=map_stretches),
