@@ -137,7 +137,7 @@ def _look_around(
     good &= np.linalg.norm(match.pixels - searches.pixels[each], axis=1) <= options.search_px
     good = good.reshape(n, starts)
     first = np.arange(n) * starts + good.argmax(axis=1)
-    agreed = good.any(axis=1)
+    agreed = np.asarray(good.any(axis=1))
     pixels = np.where(agreed[:, None], match.pixels[first], np.nan)
     return pixels, np.where(agreed, match.std_px[first], np.nan)
 
