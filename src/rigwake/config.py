@@ -73,7 +73,9 @@ class CalibrateConfig(BaseModel):
     imu_noise: ImuNoiseSettings = ImuNoiseSettings()
     tracking: TrackingOptions = TrackingOptions()
     # the rig bundle adjustment follows, so the odometry of a camera need not be perfect
-    odometry: OdometryOptions = OdometryOptions(adjust_all_frames=False)
+    odometry: OdometryOptions = OdometryOptions(
+        adjust_all_frames=False, keyframe_interval_s=0.8, global_growth=2.0
+    )
     adjustment: AdjustmentOptions = AdjustmentOptions()
     association: AssociationOptions = AssociationOptions()
 

@@ -138,9 +138,12 @@ def _adjust(
     problem = _with_intrinsics(prior.constrained(assembled.problem), selection, config, beliefs)
     believed, assembled = priors_of(problem), replace(assembled, problem=problem)
     progress(f"adjusting {len(assembled.problem.observations)} observations", 0.0)
-    adjusted = adjust(assembled, config.adjustment, final=not config.adjustment.cross_camera)
+    across = config.adjustment.cross_camera
+    # where rounds with landmarks of other cameras follow, they drop what is left of the outliers
+    options = replace(config.adjustment, rounds=1) if across else config.adjustment
+    adjusted = adjust(assembled, options, final=not across)
     matches = CrossCameraMatches.nothing()
-    if config.adjustment.cross_camera:
+    if across:
         adjusted, matches = adjust_with_association(
             hold_uncontradicted(adjusted, believed),
             selection.cameras,

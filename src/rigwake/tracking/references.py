@@ -79,7 +79,7 @@ class References:
         covariance = np.linalg.inv(self.information + np.eye(UNKNOWNS) * 1e-6)
         return np.asarray(np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2))
 
-    def take(self, index: Mask) -> References:
+    def take(self, index: Mask | NDArray[np.int64]) -> References:
         """The chosen patches."""
         return take_rows(self, index)
 

@@ -117,30 +117,29 @@ def _look_around(
 
     The search starts at the prediction, then from rings around it for those not found yet.
     """
-    n = len(searches)
-    pixels, std_px = np.full((n, 2), np.nan), np.full(n, np.nan)
     steps = np.arange(-_rings(options), _rings(options) + 1)
-    starts = _REACH_PX * np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    for shift in starts[np.argsort(np.linalg.norm(starts, axis=1), kind="stable")]:
-        open_rows = np.isnan(std_px)
-        if not open_rows.any():
-            break
-        predicted = searches.pixels[open_rows]
-        match = register(
-            coefficients,
-            references.take(open_rows),
-            shape,
-            predicted + shift,
-            searches.warps[open_rows],
-            warp_prior_std=options.warp_prior_std,
-            max_shift_px=_REACH_PX,
-        )
-        good = match.found & (match.correlation >= options.min_correlation)
-        good &= match.std_px < options.max_std_px
-        good &= np.linalg.norm(match.pixels - predicted, axis=1) <= options.search_px
-        rows = np.flatnonzero(open_rows)[good]
-        pixels[rows], std_px[rows] = match.pixels[good], match.std_px[good]
-    return pixels, std_px
+    shifts = _REACH_PX * np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    shifts = shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")]
+    n, starts = len(searches), len(shifts)
+    # all at once: a call for every ring would cost more than the registrations
+    each = np.repeat(np.arange(n), starts)
+    match = register(
+        coefficients,
+        references.take(each),
+        shape,
+        searches.pixels[each] + np.tile(shifts, (n, 1)),
+        searches.warps[each],
+        warp_prior_std=options.warp_prior_std,
+        max_shift_px=_REACH_PX,
+    )
+    good = match.found & (match.correlation >= options.min_correlation)
+    good &= match.std_px < options.max_std_px
+    good &= np.linalg.norm(match.pixels - searches.pixels[each], axis=1) <= options.search_px
+    good = good.reshape(n, starts)
+    first = np.arange(n) * starts + good.argmax(axis=1)
+    agreed = np.asarray(good.any(axis=1))
+    pixels = np.where(agreed[:, None], match.pixels[first], np.nan)
+    return pixels, np.where(agreed, match.std_px[first], np.nan)
 
 
 def _rings(options: AssociationOptions) -> int:

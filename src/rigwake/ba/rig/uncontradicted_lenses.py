@@ -50,11 +50,13 @@ def judge_lenses(adjusted: AdjustedRig, believed: Mapping[str, VectorPrior]) -> 
     if not believed:
         return adjusted
     before = adjusted.solution
-    free = solve(_freed(before.problem, believed), SETTLED)
+    start = _freed(before.problem, believed)
+    free = solve(start, NEARLY_SETTLED)
     kept = _kept(free.problem, believed)
     # nothing was moved, and nothing is to be moved: that is the optimum already
     settled = not _is_free(before.problem) and all(_is_whole(k) for k in kept.values())
-    solution = before if settled else solve(_held(free.problem, kept), SETTLED)
+    # what is held now was mostly held before: from there it is nearer than from where all is free
+    solution = before if settled else solve(_held(start, kept), SETTLED)
     return replace(
         adjusted,
         solution=_judged(solution, kept, believed),

@@ -15,6 +15,7 @@ Source: Liang and Zeger, *Longitudinal data analysis using generalized linear mo
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from rigwake._types import Array, Indices
 from rigwake.ba.solver.normal import ReducedEquations
@@ -51,23 +52,67 @@ def clustered_scatter(
             continue
         # of the frames at hand alone: for all of them at once it would not fit into memory
         used, at = np.unique(observations.frames[rows], return_inverse=True)
-        by_frame = np.einsum("fia,fak->fik", jacobian[used], score[columns[used]])
-        G = observations.by_frame[rows] @ by_frame[at]
-        if observations.by_extras.shape[2]:
-            extras = observations.extras[rows]
-            index = np.where(extras >= 0, layout.extras_start + extras, n + k)
-            G += observations.by_extras[rows] @ score[index]
-        own = starts[first : last + 1] - rows.start
-        own = own[:-1][np.diff(own) > 0]
-        scores = np.add.reduceat(np.einsum("mik,mi->mk", G, observations.residuals[rows]), own, axis=0)
+        by_frame = np.einsum("fia,fak->fik", jacobian[used], score[columns[used]], optimize=True)
+        G, scores, taken = _pulls(
+            starts[first : last + 1] - rows.start, at, by_frame, observations.by_frame[rows],
+            observations.by_landmark[rows], observations.by_extras[rows],
+            np.where(observations.extras[rows] >= 0, layout.extras_start - n + observations.extras[rows], -1),
+            observations.residuals[rows],
+        )  # fmt: skip
         observed += scores.T @ scores
-        J = observations.by_landmark[rows]
-        cross = np.add.reduceat(np.einsum("mia,mik->mak", J, G), own, axis=0)
-        block = np.add.reduceat(np.einsum("mia,mib->mab", J, J), own, axis=0)
-        block += _RIDGE * np.einsum("laa->l", block)[:, None, None] * np.eye(3) + 1e-300 * np.eye(3)
-        taken = np.einsum("lak,laj->kj", cross, np.linalg.solve(block, cross))
-        predicted += np.einsum("mik,mij->kj", G, G, optimize=True) - taken
+        predicted += G.T @ G - taken.T @ taken
     return weight * observed, weight * predicted
+
+
+@njit(cache=True, nogil=True)
+def _pulls(starts, at, by_frame, Jf, Jl, Je, extras, residuals):  # type: ignore[no-untyped-def]
+    """How observations pull at the shared parameters: G (2 m, k), the landmarks' scores (l, k), and what G loses to
+    the landmarks' own positions, as rows (3 l, k) of a root."""
+    k, count = by_frame.shape[2], len(starts) - 1
+    G, scores, taken = np.zeros((2 * len(at), k)), np.zeros((count, k)), np.zeros((3 * count, k))
+    block = np.empty((3, 3))
+    for landmark in range(count):
+        block[:] = 0.0
+        cross = taken[3 * landmark : 3 * landmark + 3]
+        for m in range(starts[landmark], starts[landmark + 1]):
+            for r in range(2):
+                row = G[2 * m + r]
+                for i in range(6):
+                    x = Jf[m, r, i]
+                    for c in range(k):
+                        row[c] += x * by_frame[at[m], i, c]
+                for a in range(extras.shape[1]):
+                    if extras[m, a] >= 0:
+                        row[extras[m, a]] += Je[m, r, a]
+                for c in range(k):
+                    scores[landmark, c] += residuals[m, r] * row[c]
+                for i in range(3):
+                    x = Jl[m, r, i]
+                    for j in range(3):
+                        block[i, j] += x * Jl[m, r, j]
+                    for c in range(k):
+                        cross[i, c] += x * row[c]
+        _solve_root(block, cross)
+    return G, scores, taken
+
+
+@njit(cache=True, nogil=True)
+def _solve_root(block, cross):  # type: ignore[no-untyped-def]
+    """`L^-1 cross` in place, L the Cholesky factor of the block with a ridge, which is left in its place."""
+    ridge = _RIDGE * (block[0, 0] + block[1, 1] + block[2, 2]) + 1e-300
+    for i in range(3):
+        block[i, i] += ridge
+    for i in range(3):
+        for j in range(i + 1):
+            total = block[i, j]
+            for q in range(j):
+                total -= block[i, q] * block[j, q]
+            block[i, j] = np.sqrt(max(total, ridge)) if i == j else total / block[j, j]
+        for q in range(i):
+            for c in range(cross.shape[1]):
+                cross[i, c] -= block[i, q] * cross[q, c]
+        for c in range(cross.shape[1]):
+            cross[i, c] /= block[i, i]
 
 
 def _chunks(starts: Indices, size: int | None = None) -> list[tuple[int, int]]:
