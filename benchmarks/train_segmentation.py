@@ -52,6 +52,8 @@ def repaint(
         cloud = np.exp(0.25 * smooth_noise(rng, shape, (6, 5)))[..., None] * rng.uniform(0.5, 1.5)
         amount = rng.uniform(0.4, 1.0)
         light[sky] = ((1 - amount) * light + amount * cloud * np.array([0.9, 0.95, 1.0]))[sky]
+    if rng.random() < 0.25:  # the glitter path of the sun: specks, wider and longer than high the nearer they are
+        light = light + glitter(rng, shape, water)[..., None] * sky_light.mean() * rng.uniform(2, 25)
     if rng.random() < 0.25:  # foam and wakes: long across, thin down
         foam = smooth_noise(rng, shape, (int(rng.integers(20, 70)), int(rng.integers(4, 16))))
         foam = foam + 0.7 * smooth_noise(rng, shape, (80, 70))
@@ -62,6 +64,18 @@ def repaint(
         air = sky_light * rng.uniform(0.7, 1.1) if sky.any() else sky_light * 0.8
         light = light * clear + (1 - clear) * air
     return light.astype(np.float32)
+
+
+def glitter(rng: np.random.Generator, shape: tuple[int, int], water: np.ndarray) -> np.ndarray:
+    """(H, W) in 0..1: where a low sun glitters on the water, in a path below the sun."""
+    rows, columns = shape
+    down = np.arange(rows, dtype=np.float32)[:, None] / rows
+    half = columns * rng.uniform(0.01, 0.09) * (0.4 + rng.uniform(0, 2.5) * down)
+    across = (np.arange(columns, dtype=np.float32)[None, :] - rng.uniform(0, columns)) / half
+    specks = smooth_noise(rng, shape, (int(rng.integers(40, 160)), int(rng.integers(20, 110))))
+    path = np.exp(-0.5 * across**2)
+    lit = np.clip((specks + rng.uniform(-1.5, 3.0) * path - rng.uniform(0.5, 2.0)) * rng.uniform(1, 4), 0, 1)
+    return (lit * path * water).astype(np.float32)
 
 
 def photograph(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -141,7 +155,7 @@ class Examples:
         elevation = elevation + rng.normal(0, 0.8)
         rows, columns = labels.shape
         weight = np.ones(labels.shape, np.float32)
-        weight[(labels == OBSTACLE) & (elevation < -0.5)[:, None]] = 2.0
+        weight[(labels == OBSTACLE) & (elevation < -0.5)[:, None]] = 1.5
         edge = cv2.morphologyEx(
             (labels == WATER).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)
         )

@@ -44,6 +44,7 @@ _APART = (
 _LEAST = 1e-3  # probability
 _SLACK_ROWS = 2  # waves and errors of the attitude carry water above the horizon
 _FAR_INVERSE_M = 1 / 2000.0
+_FAR_AWAY_M = 500.0  # cameras of one vessel see what is farther in the same direction
 
 
 @dataclass(frozen=True)
@@ -130,13 +131,14 @@ class StixelWorld:
         return np.stack([free * np.cos(azimuth), -free * np.sin(azimuth)], axis=1)
 
     def surface(self, shell_m: float = SHELL_M, layers: int = 3) -> WaterAndStixels:
-        """The nearest obstacles of every column, as a surface that views can be drawn on."""
+        """The nearest obstacles of every column, as a surface that views can be drawn on: those of unknown distance at
+        `shell_m`, what is neither obstacle nor near water (clouds, the horizon) far away."""
         distance_m = np.full((self.grid.columns, layers), np.nan)
         top_m, bottom_m = np.full_like(distance_m, np.nan), np.zeros_like(distance_m)
-        distance, _ = self.range_m()
+        distance = np.where(np.isfinite(self.inverse_m), self.range_m()[0], shell_m)
         used = np.zeros(self.grid.columns, int)
-        known = np.flatnonzero((self.kind == OBSTACLE) & np.isfinite(distance) & (distance < 500))
-        for k in known[np.argsort(distance[known], kind="stable")]:
+        near = np.flatnonzero((self.kind == OBSTACLE) & (distance < _FAR_AWAY_M))
+        for k in near[np.argsort(distance[near], kind="stable")]:
             c = self.column[k]
             if used[c] < layers:
                 elevation = np.deg2rad(
@@ -147,7 +149,7 @@ class StixelWorld:
                 top_m[c, used[c]] = np.inf if self.top[k] == 0 else heights[0]
                 bottom_m[c, used[c]] = 0.0 if self.stands[k] else max(float(heights[1]), 0.0)
                 used[c] += 1
-        return WaterAndStixels(distance_m, top_m, bottom_m, shell_m)
+        return WaterAndStixels(distance_m, top_m, bottom_m, max(shell_m, _FAR_AWAY_M))
 
 
 def find_stixels(
