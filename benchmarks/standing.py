@@ -3,8 +3,9 @@
     python benchmarks/standing.py [--folder SHOTS] [--scenes quay marina ..] [--sets 3] [--only labels stixels ..]
 
 Three scenes are close quarters (`quay`, `marina`, `basin`), three are open (`demo`, `bay`, `buoys`); no network was
-trained on them (`view_shots.py`). Attitude and height are the true ones, but where the height is estimated. Range errors
-are medians; NEES/dof is the median squared error in units of the predicted variance over that of a normal distribution.
+trained on them (`view_shots.py`). Attitude, way and height are the true ones, but where the height is estimated. Range
+errors are medians; NEES/dof is the median squared error in units of the predicted variance over that of a normal
+distribution.
 """
 
 from __future__ import annotations
@@ -33,10 +34,11 @@ from rigwake.views.depth.depth_panorama import (
     matched_points,
     tested_by_height,
 )
+from rigwake.views.depth.motion import Earlier
 from rigwake.views.height import estimate_height
 from rigwake.views.scene.label_measures import LabelComparison, flat_horizon
 from rigwake.views.scene.network import shipped_network
-from rigwake.views.scene.segmentation import OBSTACLE, WATER, Labels, segment_strip
+from rigwake.views.scene.segmentation import OBSTACLE, WATER, Labels, PixelClassifier, segment_strip
 from rigwake.views.scene.stixel_source import contact_shifts
 from rigwake.views.scene.stixel_world import StixelWorld, find_stixels
 from rigwake.views.seams import RANGE_EDGES_M, SeamMeter
@@ -65,12 +67,13 @@ class Seen:
     true_labels: np.ndarray
 
 
-def estimate(rig: SurroundRig, shot: ViewShot, classifier: object) -> Seen:
+def estimate(rig: SurroundRig, shot: ViewShot, classifier: PixelClassifier, by_motion: bool) -> Seen:
     """All estimates of one frame set, each on its own (nothing is smoothed over time)."""
     surface, attitude = WaterAndShell(), shot.attitude
     strip = level_strip(shot.images, rig, attitude, surface, GRID, shot.hulls)
     alone = segment_strip(strip, classifier)
-    matched = matched_points(shot.images, rig, attitude, shot.hulls)
+    earlier = Earlier(shot.images_before, shot.rig_from_rig_before) if by_motion else None
+    matched = matched_points(shot.images, rig, attitude, shot.hulls, earlier=earlier)
     labels = tested_by_height(alone, matched, GRID, attitude)
     depth = fuse_depth(matched, labels, GRID, attitude)
     true_labels = labels_drawn(rig, shot, strip)
@@ -103,7 +106,7 @@ def _sure(classes: np.ndarray) -> Labels:
     return Labels(classes, probability)
 
 
-def label_rows(name: str, seen: Sequence[Seen]) -> list[str]:
+def label_rows(name: str, seen: Sequence[Seen], rig: SurroundRig) -> list[str]:
     """Measures of the labels: the network alone, with the test by height, and a cut at the horizon."""
     elevation = np.rad2deg(GRID.elevations())
     lines = []
@@ -123,7 +126,7 @@ def label_rows(name: str, seen: Sequence[Seen]) -> list[str]:
     return lines
 
 
-def stixel_rows(name: str, seen: Sequence[Seen]) -> list[str]:
+def stixel_rows(name: str, seen: Sequence[Seen], rig: SurroundRig) -> list[str]:
     """Range errors of stixels that stand in the water, and agreement of the free water."""
     lines = []
     for words, chosen in (("network", lambda s: s.world), ("true labels", lambda s: s.true_world)):
@@ -182,7 +185,7 @@ def _free_areas(s: Seen, world: StixelWorld) -> tuple[float, float]:
     return float((np.minimum(free, true)[both] ** 2).sum()), float((np.maximum(free, true)[both] ** 2).sum())
 
 
-def depth_rows(name: str, seen: Sequence[Seen]) -> list[str]:
+def depth_rows(name: str, seen: Sequence[Seen], rig: SurroundRig) -> list[str]:
     """Errors of matched ranges on land and of the plane on water, density, and what the confidence is worth."""
     found = [_depth_errors(s) for s in seen]
     true, error, confidence = (np.concatenate([f[k] for f in found]) for k in range(3))
@@ -223,9 +226,7 @@ def seam_rows(name: str, seen: Sequence[Seen], rig: SurroundRig) -> list[str]:
         ("true labels", lambda s: s.true_world.surface()),
         ("shell", lambda s: WaterAndShell()),
     ):
-        matches = [
-            m for s in seen for m in meter.measure(s.shot.frame_set(rig), s.shot.attitude, surface(s))
-        ]
+        matches = [m for s in seen for m in meter.measure(s.shot.frame_set(rig), s.shot.attitude, surface(s))]
         size = np.concatenate([np.linalg.norm(m.misalignment_px, axis=1) for m in matches])
         ranges = np.concatenate([m.range_m for m in matches])
         line = f"{name:8}{words:12}"
@@ -263,8 +264,10 @@ def height_rows(name: str, seen: Sequence[Seen], rig: SurroundRig) -> list[str]:
     ]
 
 
-def buoy_rows(name: str, seen: Sequence[Seen]) -> list[str]:
+def buoy_rows(name: str, seen: Sequence[Seen], rig: SurroundRig) -> list[str]:
     """Buoys found among the stixels: how often, and how far away."""
+    if not any(len(s.shot.buoys_level) for s in seen):
+        return []
     lines = []
     found: dict[float, list[float]] = {}
     for s in seen:
@@ -292,6 +295,14 @@ def buoy_rows(name: str, seen: Sequence[Seen]) -> list[str]:
     return lines
 
 
+ROWS: dict[str, Callable[[str, Sequence[Seen], SurroundRig], list[str]]] = {
+    "labels": label_rows,
+    "stixels": stixel_rows,
+    "depth": depth_rows,
+    "seams": seam_rows,
+    "height": height_rows,
+    "buoys": buoy_rows,
+}
 HEADS = {
     "labels": f"{'':24}{'mIoU':>7}{'recall':>8}{'precis.':>8}{'edge':>8}{'objects':>12}{'false':>7}",
     "stixels": f"{'':20}{'to 15 m, NEES, off':>19}{'15-30 m':>19}{'30-50 m':>19}{'free':>8}{'false%':>8}",
@@ -312,6 +323,8 @@ def main() -> None:
     )
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
     parser.add_argument("--sets", type=int, default=3, help="frame sets per scene (buoys: twice as many)")
+    parser.add_argument("--no-motion", action="store_true", help="match cameras only, no earlier pictures")
+    parser.add_argument("--model", type=Path, help="another network (ONNX) in place of the one shipped")
     parser.add_argument("--only", nargs="+", default=list(TABLES), choices=TABLES)
     options = parser.parse_args()
     cv2.setNumThreads(1)
@@ -321,27 +334,21 @@ def main() -> None:
 
 def _tables(options: argparse.Namespace, folder: Path) -> None:
     network = shipped_network()
+    if options.model is not None:
+        network = replace(network, name=options.model.name, _net=cv2.dnn.readNetFromONNX(str(options.model)))
     tables: dict[str, list[str]] = {key: [] for key in options.only}
     for name in options.scenes:
         rig = scene_rig(name)
         shots = scene_shots(name, options.sets * (2 if name == "buoys" else 1), folder)
         start = time.process_time()
-        seen = [estimate(rig, shot, network) for shot in shots]
+        seen = [estimate(rig, shot, network, not options.no_motion) for shot in shots]
         print(
             f"{name}: {len(shots)} frame sets, {time.process_time() - start:.1f} CPU-s, "
             f"{'close quarters' if name in CLOSE else 'open water'}",
             flush=True,
         )
-        rows: dict[str, Callable[[], list[str]]] = {
-            "labels": lambda: label_rows(name, seen),
-            "stixels": lambda: stixel_rows(name, seen),
-            "depth": lambda: depth_rows(name, seen),
-            "seams": lambda: seam_rows(name, seen, rig),
-            "height": lambda: height_rows(name, seen, rig),
-            "buoys": lambda: buoy_rows(name, seen) if name == "buoys" else [],
-        }
         for key in options.only:
-            tables[key] += rows[key]()
+            tables[key] += ROWS[key](name, seen, rig)
     for key in options.only:
         print(f"\n{key}: {HEADS[key]}" if key == "buoys" else f"\n{key}\n{HEADS[key]}")
         print("\n".join(tables[key]))

@@ -1,7 +1,7 @@
 """Frame sets of simulated scenes with everything known about them, for benchmarks of the views.
 
-Six scenes that no network was trained on, three of them close quarters. Pictures, the own hull, the attitude, and what a
-camera in the viewpoint would see (classes and ranges in the grid of the level strip) are kept in a folder.
+Six scenes that no network was trained on, three of them close quarters. Pictures, the own hull, the attitude, and what
+a camera in the viewpoint would see (classes and ranges in the grid of the level strip) are kept in a folder.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import numpy as np
 
 from rigwake._types import Array, Image, Mask
 from rigwake.geometry.se3 import SE3
-
 from rigwake.simulation.meshes import join, tube
 from rigwake.simulation.record import Shot, build_world
 from rigwake.simulation.render import Renderer
@@ -49,7 +48,8 @@ _CHANGES: dict[str, tuple[str, dict[str, Any]]] = {
         "weather": {"sun_azimuth_deg": 80, "sun_elevation_deg": 35, "cloud_cover": 0.5},
     }),
     "buoys": ("demo", {
-        "seed": 91, "scene": {"layout": "bay", "size_m": [240, 200], "density": 0.5}, "sea": {"hs_m": 0.12, "tp_s": 2.6},
+        "seed": 91, "scene": {"layout": "bay", "size_m": [240, 200], "density": 0.5},
+        "sea": {"hs_m": 0.12, "tp_s": 2.6},
         "weather": {"sun_azimuth_deg": 200, "sun_elevation_deg": 30, "cloud_cover": 0.7},
         "vessel": {"hull": "catamaran", "manoeuvres": _STRAIGHT},
     }),

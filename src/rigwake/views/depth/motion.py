@@ -1,22 +1,27 @@
 """Ranges from one camera that moves: its picture now and a little earlier are the two views of a pair.
 
-The pair is matched like that of two cameras (`epipolar`), with the way the camera went as baseline. What moves by itself
-has a wrong range, which shows as a disagreement with the water plane or with other pairs; mirror images and glitter lie
-under the water plane or nowhere, the second cue about what is water (`depth_panorama.tested_by_height`).
+The pair is matched like that of two cameras (`epipolar`), with the way the camera went as baseline. What moves by
+itself has a wrong range, which shows as a disagreement with the water plane or with other pairs; mirror images lie
+under the plane, which tells them from what stands on it (`depth_panorama.tested_by_height`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from rigwake._types import Image, Mask
+from rigwake._types import Image, Mask, Stamps
+from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.views.attitude import LevelAttitude
+from rigwake.views.attitude import AttitudeTrack, LevelAttitude
 from rigwake.views.depth.epipolar import MatchedPoints, epipolar_pairs, match_pair
 from rigwake.views.surround_rig import SurroundRig
+
+_LEAST_WAY_M = 0.6
+_LONGEST_NS = 2_000_000_000  # boats and waves move on
+_MOST_TURN = np.deg2rad(35.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +65,16 @@ def moved_points(
     return found
 
 
-def is_far_enough(rig_from_rig_then: SE3, least_m: float, most_turn: float) -> bool:
-    """Whether the rig has gone far enough for a baseline, and not turned so much that it sees other things (radians)."""
-    angle = np.arccos(np.clip((np.trace(rig_from_rig_then.rotation) - 1) / 2, -1, 1))
-    return bool(np.linalg.norm(rig_from_rig_then.translation) >= least_m and angle <= most_turn)
+def earlier_time(track: AttitudeTrack | None, times_ns: Sequence[int] | Stamps, now_ns: int) -> int | None:
+    """The latest of the times (rig clock, increasing) before `now_ns` since when the rig has gone far enough for a
+    baseline, and has not turned too far; None if there is none or the way is not known."""
+    if track is None:
+        return None
+    times = np.asarray(times_ns, dtype=np.int64)
+    for then in times[(times < now_ns) & (times > now_ns - _LONGEST_NS)][::-1].tolist():
+        moved = track.moved(then, now_ns)
+        if moved is None or np.linalg.norm(so3.log(moved.rotation)) > _MOST_TURN:
+            return None
+        if np.linalg.norm(moved.translation) >= _LEAST_WAY_M:
+            return int(then)
+    return None
