@@ -12,9 +12,10 @@ from rigwake.views.depth.depth_files import point_cloud
 from rigwake.views.depth.depth_panorama import MATCHED, PLANE, fuse_depth, matched_points
 from rigwake.views.depth.epipolar import MatchedPoints, epipolar_pairs
 from rigwake.views.scene.segmentation import Labels
+from rigwake.views.scene.stixel_cut import cut_columns
 from rigwake.views.scene.stixel_files import world_to_dict
 from rigwake.views.scene.stixel_source import StixelEstimator, contact_shifts
-from rigwake.views.scene.stixel_world import cut_columns, find_stixels
+from rigwake.views.scene.stixel_world import find_stixels
 from rigwake.views.strips import StripGrid, level_strip
 from rigwake.views.surface import WaterAndShell
 from view_scenes import HEIGHT_M, attitude, four_cameras, photograph, water_and_ring
