@@ -82,8 +82,10 @@ class AttitudeTrack:
             return None
         if not way.timestamps_ns[0] <= min(then_ns, now_ns) <= max(then_ns, now_ns) <= way.timestamps_ns[-1]:
             return None
-        if len(np.unique(way.between(min(then_ns, now_ns), max(then_ns, now_ns)).segment_ids)) > 1:
-            return None
+        assert way.segment_ids is not None
+        first, last = np.searchsorted(way.timestamps_ns, sorted((then_ns, now_ns)), side="right") - 1
+        if way.segment_ids[first] != way.segment_ids[min(last + 1, len(way) - 1)]:
+            return None  # odometry broke in between
         poses = interpolate(way.timestamps_ns, way.world_from_body, np.array([then_ns, now_ns]))
         return poses[1].inverse() * poses[0]
 
