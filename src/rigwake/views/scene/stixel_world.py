@@ -237,7 +237,7 @@ def _cheapest_cut(
     lowest = np.where(seen.any(axis=0), rows - np.argmax(seen[::-1], axis=0), 0)
     highest = np.where(seen.any(axis=0), np.argmax(seen, axis=0), 0)
     by_column = [np.ascontiguousarray(plane.T) for plane in (weight, value, contact, contact_std)]
-    return cut_columns(  # type: ignore[no-any-return]
+    return cut_columns(
         np.ascontiguousarray(np.moveaxis(cost, -1, 0), dtype=np.float64),
         *by_column,
         lowest.astype(np.int64),
