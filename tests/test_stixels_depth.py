@@ -6,15 +6,19 @@ import numpy as np
 import pytest
 
 from rigwake.errors import UsageError
-from rigwake.views.attitude import LevelAttitude
+from rigwake.geometry.se3 import SE3
+from rigwake.trajectory import Trajectory
+from rigwake.views.attitude import LevelAttitude, track_from_trajectory
 from rigwake.views.depth import depth_panorama
 from rigwake.views.depth.depth_files import point_cloud
 from rigwake.views.depth.depth_panorama import MATCHED, PLANE, fuse_depth, matched_points
 from rigwake.views.depth.epipolar import MatchedPoints, epipolar_pairs
+from rigwake.views.depth.motion import Earlier, earlier_time, moved_points
 from rigwake.views.scene.segmentation import Labels
+from rigwake.views.scene.stixel_cut import cut_columns
 from rigwake.views.scene.stixel_files import world_to_dict
 from rigwake.views.scene.stixel_source import StixelEstimator, contact_shifts
-from rigwake.views.scene.stixel_world import cut_columns, find_stixels
+from rigwake.views.scene.stixel_world import find_stixels
 from rigwake.views.strips import StripGrid, level_strip
 from rigwake.views.surface import WaterAndShell
 from view_scenes import HEIGHT_M, attitude, four_cameras, photograph, water_and_ring
@@ -130,6 +134,35 @@ def test_ranges_of_two_cameras(seen) -> None:  # type: ignore[no-untyped-def]
     cloud = point_cloud(depth, level_strip(images, rig, stand, WaterAndShell(40.0), GRID))
     assert cloud.startswith(b"ply")
     assert len(cloud) > 19 * on_wall.sum()
+
+
+def test_one_camera_that_moves_shows_ranges(seen) -> None:  # type: ignore[no-untyped-def]
+    rig, stand, images, _ = seen
+    step_level = np.array([0.9, 0.2, 0.0])
+    world = water_and_ring(RADIUS_M, is_mottled=True)
+    then = photograph(rig, stand, lambda origins, rays: world(origins - step_level, rays))
+    moved = SE3(np.eye(3), -(stand.level_from_rig.T @ step_level))
+    left = {"left": images["left"]}
+    found = moved_points(left, Earlier(then, moved), rig, stand)
+    assert {points.names for points in found} == {("left", "left")}
+    points = np.concatenate([p.points_level for p in found])
+    on_wall = points[:, 2] + HEIGHT_M > 0.5
+    distance = np.hypot(points[on_wall, 0], points[on_wall, 1])
+    assert on_wall.sum() > 5000
+    assert np.median(np.abs(distance / RADIUS_M - 1)) < 0.02
+    assert moved_points(left, Earlier(then, SE3.identity()), rig, stand) == []
+
+
+def test_the_earlier_picture_is_the_latest_that_is_far_enough() -> None:
+    times = np.arange(0, 3_000_000_000, 100_000_000)
+    way = np.stack([np.minimum(1.05e-9 * times, 2.0), 0 * times, 0 * times], axis=1)
+    poses = SE3(np.broadcast_to(np.eye(3), (len(times), 3, 3)), way)
+    track = track_from_trajectory(Trajectory("way", times, poses), four_cameras())
+    assert earlier_time(track, times, 1_500_000_000) == 900_000_000
+    assert earlier_time(track, times, 2_900_000_000) == 1_300_000_000
+    assert earlier_time(track, times, 300_000_000) is None
+    assert earlier_time(track, times, 9_000_000_000) is None
+    assert earlier_time(None, times, 1_500_000_000) is None
 
 
 def test_water_is_never_matched(seen) -> None:  # type: ignore[no-untyped-def]

@@ -15,6 +15,7 @@ from scipy.ndimage import uniform_filter1d
 from rigwake._types import Array, Stamps
 from rigwake.errors import InputError
 from rigwake.geometry import so3
+from rigwake.geometry.interpolate import interpolate
 from rigwake.geometry.se3 import SE3
 from rigwake.odometry.gyro import integrate_gyro
 from rigwake.recording import AttitudeStream, ImuStream
@@ -61,7 +62,8 @@ class AttitudeTrack:
     """Attitudes over time.
 
     timestamps_ns: (N,) strictly increasing, rig clock. level_from_rig: (N, 3, 3). heave_m: (N,) of the viewpoint about
-    its mean height. height_m, height_std_m: that mean height; NaN where unknown. source, tilt_std: see `LevelAttitude`.
+    its mean height. height_m, height_std_m: that mean height; NaN where unknown. source, tilt_std: see
+    `LevelAttitude`. world_from_rig: where it comes from, if from a trajectory.
     """
 
     timestamps_ns: Stamps
@@ -71,6 +73,21 @@ class AttitudeTrack:
     heave_m: Array
     height_m: float = np.nan
     height_std_m: float = 0.0
+    world_from_rig: Trajectory | None = None
+
+    def moved(self, then_ns: int, now_ns: int) -> SE3 | None:
+        """`rig_from_rig` from the axes of then to those of now, metres; None where the way is not known."""
+        way = self.world_from_rig
+        if way is None or not way.is_metric:
+            return None
+        if not way.timestamps_ns[0] <= min(then_ns, now_ns) <= max(then_ns, now_ns) <= way.timestamps_ns[-1]:
+            return None
+        assert way.segment_ids is not None
+        first, last = np.searchsorted(way.timestamps_ns, sorted((then_ns, now_ns)), side="right") - 1
+        if way.segment_ids[first] != way.segment_ids[min(last + 1, len(way) - 1)]:
+            return None  # odometry broke in between
+        poses = interpolate(way.timestamps_ns, way.world_from_body, np.array([then_ns, now_ns]))
+        return poses[1].inverse() * poses[0]
 
     def at(self, timestamp_ns: int) -> LevelAttitude:
         """The attitude at a time, by SLERP between neighbours; the nearest one beyond the ends."""
@@ -136,6 +153,7 @@ def track_from_trajectory(world_from_rig: Trajectory, rig: SurroundRig) -> Attit
         "trajectory",
         _TRAJECTORY_TILT_STD,
         heave,
+        world_from_rig=world_from_rig,
     )
 
 

@@ -21,6 +21,7 @@ from rigwake.tracking.masks import beyond_image_circle
 from rigwake.tracking.self_mask import find_self_mask
 from rigwake.views.attitude import LevelAttitude
 from rigwake.views.colour import ColourModel, ColourSamples, colour_samples, fit_colour
+from rigwake.views.depth.motion import Earlier, earlier_time
 from rigwake.views.frames import FrameSet, frame_sets, output_times, require_fit
 from rigwake.views.height import HeightEstimate, estimate_height
 from rigwake.views.levelling import Leveller, choose_attitudes
@@ -91,6 +92,16 @@ class SurroundSetup:
         frames = list(frame_sets(self.streams, self.rig, times[first : index + 1]))[-1]
         require_pictures(frames)
         return frames
+
+    def earlier(self, frames: FrameSet) -> Earlier | None:
+        """The pictures before a frame set that show ranges by the way made since; None where the way is not known."""
+        track = self.leveller.track
+        then_ns = earlier_time(track, self.times_ns(), frames.timestamp_ns)
+        moved = None if track is None or then_ns is None else track.moved(then_ns, frames.timestamp_ns)
+        if moved is None or then_ns is None:
+            return None
+        before = next(iter(frame_sets(self.streams, self.rig, [then_ns])))
+        return Earlier(before.images(self.rig), moved)
 
     def surface_at(self, frames: FrameSet, attitude: LevelAttitude) -> Surface:
         """The surface at the time of a frame set."""

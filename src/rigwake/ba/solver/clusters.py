@@ -15,8 +15,8 @@ Source: Liang and Zeger, *Longitudinal data analysis using generalized linear mo
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from rigwake._kernels import njit
 from rigwake._types import Array, Indices
 from rigwake.ba.solver.normal import ReducedEquations
 from rigwake.ba.solver.parameter_layout import ParameterLayout
@@ -64,7 +64,7 @@ def clustered_scatter(
     return weight * observed, weight * predicted
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _pulls(starts, at, by_frame, Jf, Jl, Je, extras, residuals):  # type: ignore[no-untyped-def]
     """How observations pull at the shared parameters: G (2 m, k), the landmarks' scores (l, k), and what G loses to
     the landmarks' own positions, as rows (3 l, k) of a root."""
@@ -96,7 +96,7 @@ def _pulls(starts, at, by_frame, Jf, Jl, Je, extras, residuals):  # type: ignore
     return G, scores, taken
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _solve_root(block, cross):  # type: ignore[no-untyped-def]
     """`L^-1 cross` in place, L the Cholesky factor of the block with a ridge, which is left in its place."""
     ridge = _RIDGE * (block[0, 0] + block[1, 1] + block[2, 2]) + 1e-300

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rigwake._types import Array, Image, Mask
 from rigwake.views.attitude import LevelAttitude
 from rigwake.views.depth.epipolar import MatchedPoints, epipolar_pairs, match_pair
+from rigwake.views.depth.motion import Earlier, moved_points
 from rigwake.views.scene.segmentation import NOT_SEEN, OBSTACLE, WATER, Labels
 from rigwake.views.strips import StripGrid
 from rigwake.views.surface import SHELL_M, WaterAndDepth
@@ -61,12 +62,14 @@ def matched_points(
     attitude: LevelAttitude,
     masks: Mapping[str, Mask] | None = None,
     nearest_m: float = 3.0,
+    earlier: Earlier | None = None,
 ) -> list[MatchedPoints]:
-    """What every two cameras of a frame set see in common."""
+    """What every two cameras of a frame set see in common, and with `earlier` what each sees now and saw then."""
     found = [
         match_pair(pair, images, rig, attitude, masks, nearest_m) for pair in epipolar_pairs(rig, attitude)
     ]
-    return [points for points in found if points is not None]
+    by_motion = [] if earlier is None else moved_points(images, earlier, rig, attitude, masks, nearest_m)
+    return [points for points in found if points is not None] + by_motion
 
 
 def tested_by_height(

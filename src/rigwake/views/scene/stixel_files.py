@@ -97,7 +97,9 @@ def stixels_to_folder(
     lines, count, unsure, nearest = [], 0, 0, None
     for done, frames in enumerate(frame_sets(setup.streams, setup.rig, chosen)):
         images, attitude = frames.images(setup.rig), setup.attitude_at(frames)
-        strip, labels, world = estimator.estimate(images, attitude, frames.timestamp_ns)
+        strip, labels, world = estimator.estimate(
+            images, attitude, frames.timestamp_ns, setup.earlier(frames) if uses_matches else None
+        )
         unsure += bool(labels.words)
         lines.append(json.dumps(world_to_dict(world, labels.words, frames.missing), allow_nan=False))
         write_image(folder / "overlays" / f"{frames.timestamp_ns}.jpg", draw_stixels(strip, world))

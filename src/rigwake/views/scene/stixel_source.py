@@ -11,6 +11,7 @@ import numpy as np
 from rigwake._types import Array, Image, Mask
 from rigwake.views.attitude import LevelAttitude
 from rigwake.views.depth.depth_panorama import fuse_depth, matched_points, tested_by_height
+from rigwake.views.depth.motion import Earlier
 from rigwake.views.scene.network import shipped_network
 from rigwake.views.scene.segmentation import (
     OBSTACLE,
@@ -46,18 +47,23 @@ class StixelEstimator:
         self._smoothed = SmoothedLabels(self.classifier)
 
     def estimate(
-        self, images: Mapping[str, Image], attitude: LevelAttitude, timestamp_ns: int
+        self,
+        images: Mapping[str, Image],
+        attitude: LevelAttitude,
+        timestamp_ns: int,
+        earlier: Earlier | None = None,
     ) -> tuple[LevelStrip, Labels, StixelWorld]:
         """Strip, labels and stixels of the frame set that follows.
 
-        images: by camera name. Raises UsageError if the height above the water is not known.
+        images: by camera name. earlier: pictures that show ranges by motion.
+        Raises UsageError if the height above the water is not known.
         """
         surface = WaterAndShell(self.shell_m)
         strip = level_strip(images, self.rig, attitude, surface, self.grid, self.masks, timestamp_ns)
         labels = segment_strip(strip, self.classifier)
         inverse: tuple[Array | None, Array | None] = (None, None)
-        if self.uses_matches and len(images) > 1:
-            matched = matched_points(images, self.rig, attitude, self.masks)
+        if self.uses_matches and (len(images) > 1 or earlier is not None):
+            matched = matched_points(images, self.rig, attitude, self.masks, earlier=earlier)
             labels = tested_by_height(labels, matched, self.grid, attitude)
             labels = self._smoothed.next(strip, labels)
             inverse = fuse_depth(matched, labels, self.grid, attitude, timestamp_ns).inverse_horizontal()

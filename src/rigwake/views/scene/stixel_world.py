@@ -8,7 +8,6 @@ Source of the method: Hernandez-Juarez et al. (2019), *Slanted Stixels* (here wi
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -17,19 +16,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigwake._kernels import njit
 from rigwake._types import Array
 from rigwake.errors import UsageError
 from rigwake.views.attitude import LevelAttitude
 from rigwake.views.scene.segmentation import NOT_SEEN, OBSTACLE, SKY, WATER, Labels
+from rigwake.views.scene.stixel_cut import cut_columns
 from rigwake.views.strips import StripGrid
 from rigwake.views.surface import SHELL_M, WaterAndStixels
 
 KINDS = ("water", "obstacle", "sky")
-_PIECE_COST = 5.0  # nats per piece: rows of one column are far from independent
 _EVIDENCE = 0.5  # of the class probabilities, for the same reason
-_BEHIND_COST = 3.0  # water seen behind an obstacle, over its top
-_OVERHEAD_COST = 6.0  # an obstacle above the sky
 _EDGE_STD = np.deg2rad(0.15)  # of a contact with the water that the segmentation is sure of
 _EDGE_PER_ROW = 0.3  # more, in rows, for every row around it that the segmentation is not sure of
 _UNSURE = 0.6  # difference of two probabilities
@@ -42,8 +38,8 @@ _APART = (
     2.5  # standard deviations between contact and match, beyond which their difference is the uncertainty
 )
 _LEAST = 1e-3  # probability
-_SLACK_ROWS = 2  # waves and errors of the attitude carry water above the horizon
 _FAR_INVERSE_M = 1 / 2000.0
+_FAR_AWAY_M = 500.0  # cameras of one vessel see what is farther in the same direction
 
 
 @dataclass(frozen=True)
@@ -130,13 +126,14 @@ class StixelWorld:
         return np.stack([free * np.cos(azimuth), -free * np.sin(azimuth)], axis=1)
 
     def surface(self, shell_m: float = SHELL_M, layers: int = 3) -> WaterAndStixels:
-        """The nearest obstacles of every column, as a surface that views can be drawn on."""
+        """The nearest obstacles of every column, as a surface that views can be drawn on: those of unknown distance at
+        `shell_m`, what is neither obstacle nor near water (clouds, the horizon) far away."""
         distance_m = np.full((self.grid.columns, layers), np.nan)
         top_m, bottom_m = np.full_like(distance_m, np.nan), np.zeros_like(distance_m)
-        distance, _ = self.range_m()
+        distance = np.where(np.isfinite(self.inverse_m), self.range_m()[0], shell_m)
         used = np.zeros(self.grid.columns, int)
-        known = np.flatnonzero((self.kind == OBSTACLE) & np.isfinite(distance) & (distance < 500))
-        for k in known[np.argsort(distance[known], kind="stable")]:
+        near = np.flatnonzero((self.kind == OBSTACLE) & (distance < _FAR_AWAY_M))
+        for k in near[np.argsort(distance[near], kind="stable")]:
             c = self.column[k]
             if used[c] < layers:
                 elevation = np.deg2rad(
@@ -147,7 +144,7 @@ class StixelWorld:
                 top_m[c, used[c]] = np.inf if self.top[k] == 0 else heights[0]
                 bottom_m[c, used[c]] = 0.0 if self.stands[k] else max(float(heights[1]), 0.0)
                 used[c] += 1
-        return WaterAndStixels(distance_m, top_m, bottom_m, shell_m)
+        return WaterAndStixels(distance_m, top_m, bottom_m, max(shell_m, _FAR_AWAY_M))
 
 
 def find_stixels(
@@ -167,48 +164,20 @@ def find_stixels(
     the native picture. contact_std_deg: of a contact.
     Raises UsageError if the height above the water is not known.
     """
-    height, height_std = attitude.height_m, attitude.height_std_m
+    height = attitude.height_m
     if not np.isfinite(height) or height <= 0:
         raise UsageError(
             "The height of the cameras above the water is not known.",
             consequence="A foot in the water has no distance.",
             remedy="Give it: --height-m METRES (mean height of the cameras above the water).",
         )
-    rows, columns = labels.classes.shape
-    cost = -_EVIDENCE * np.log(np.maximum(labels.probability, _LEAST))
-    weight = np.zeros((rows, columns))
-    value = np.zeros((rows, columns))
-    if inverse_m is not None and inverse_std is not None:
-        known = np.isfinite(inverse_m) & np.isfinite(inverse_std) & (inverse_std > 0)
-        weight[known] = 1 / np.square(_CORRELATED * inverse_std[known])
-        value[known] = inverse_m[known]
-    edges = np.deg2rad(grid.top_deg - np.arange(rows + 1) * grid.step_deg)[:, None]
-    lowered = np.zeros((rows, columns)) if contact_shift_deg is None else np.deg2rad(contact_shift_deg)
-    depression = -np.broadcast_to(edges, (rows + 1, columns)).copy()
-    depression[1:] += lowered
-    slope = np.tan(np.clip(depression, 0.0, 1.5))
-    edge_std = _edge_std(labels, grid) if contact_std_deg is None else np.deg2rad(contact_std_deg)
-    angle_std = np.hypot(edge_std, attitude.tilt_std)
-    contact = slope / height
-    contact_std = np.hypot((1 + slope**2) * angle_std / height, contact * height_std / height)
-    seen = labels.classes != NOT_SEEN
-    lowest = np.where(seen.any(axis=0), rows - np.argmax(seen[::-1], axis=0), 0)
-    highest = np.where(seen.any(axis=0), np.argmax(seen, axis=0), 0)
-    horizon = int(np.ceil(grid.horizon_row))
-    count, cut = cut_columns(
-        np.ascontiguousarray(np.moveaxis(cost, -1, 0), dtype=np.float64),
-        np.ascontiguousarray(weight.T),
-        np.ascontiguousarray(value.T),
-        np.ascontiguousarray(contact.T),
-        np.ascontiguousarray(contact_std.T),
-        lowest.astype(np.int64),
-        highest.astype(np.int64),
-        horizon,
-    )
+    columns = labels.classes.shape[1]
+    contact, contact_std = _contacts(labels, grid, attitude, contact_shift_deg, contact_std_deg)
+    count, cut = _cheapest_cut(labels, grid, contact, contact_std, inverse_m, inverse_std)
     column = np.repeat(np.arange(columns), count).astype(np.int32)
-    pieces = np.concatenate([cut[c, : count[c]] for c in range(columns)]) if count.any() else np.zeros((0, 6))
+    pieces = np.concatenate([cut[c, : count[c]] for c in range(columns)]) if count.any() else np.zeros((0, 4))
     bottom, top, kind = (pieces[:, k].astype(np.int64) for k in range(3))
-    stands = pieces[:, 5] > 0
+    stands = pieces[:, 3] > 0
     foot = (contact[bottom, column], contact_std[bottom, column])
     inverse, inverse_sd = _ranges(
         bottom, top, column, stands & (kind == OBSTACLE), foot, inverse_m, inverse_std
@@ -225,6 +194,56 @@ def find_stixels(
         grid, column, bottom.astype(np.int32), top.astype(np.int32), kind.astype(np.uint8), inverse, inverse_sd,
         stands, mean, height, timestamp_ns,
     )  # fmt: skip
+
+
+def _contacts(
+    labels: Labels,
+    grid: StripGrid,
+    attitude: LevelAttitude,
+    shift_deg: Array | None,
+    std_deg: float | None,
+) -> tuple[Array, Array]:
+    """(rows + 1, columns) inverse distance of a foot at each row edge, and its standard deviation."""
+    rows, columns = labels.classes.shape
+    height, height_std = attitude.height_m, attitude.height_std_m
+    edges = np.deg2rad(grid.top_deg - np.arange(rows + 1) * grid.step_deg)[:, None]
+    depression = -np.broadcast_to(edges, (rows + 1, columns)).copy()
+    if shift_deg is not None:
+        depression[1:] += np.deg2rad(shift_deg)
+    slope = np.tan(np.clip(depression, 0.0, 1.5))
+    edge_std = _edge_std(labels, grid) if std_deg is None else np.deg2rad(std_deg)
+    angle_std = np.hypot(edge_std, attitude.tilt_std)
+    contact = slope / height
+    return contact, np.hypot((1 + slope**2) * angle_std / height, contact * height_std / height)
+
+
+def _cheapest_cut(
+    labels: Labels,
+    grid: StripGrid,
+    contact: Array,
+    contact_std: Array,
+    inverse_m: Array | None,
+    inverse_std: Array | None,
+) -> tuple[Any, Any]:
+    """As `cut_columns`, of all columns of a strip."""
+    rows, columns = labels.classes.shape
+    cost = -_EVIDENCE * np.log(np.maximum(labels.probability, _LEAST))
+    weight, value = np.zeros((rows, columns)), np.zeros((rows, columns))
+    if inverse_m is not None and inverse_std is not None:
+        known = np.isfinite(inverse_m) & np.isfinite(inverse_std) & (inverse_std > 0)
+        weight[known] = 1 / np.square(_CORRELATED * inverse_std[known])
+        value[known] = inverse_m[known]
+    seen = labels.classes != NOT_SEEN
+    lowest = np.where(seen.any(axis=0), rows - np.argmax(seen[::-1], axis=0), 0)
+    highest = np.where(seen.any(axis=0), np.argmax(seen, axis=0), 0)
+    by_column = [np.ascontiguousarray(plane.T) for plane in (weight, value, contact, contact_std)]
+    return cut_columns(
+        np.ascontiguousarray(np.moveaxis(cost, -1, 0), dtype=np.float64),
+        *by_column,
+        lowest.astype(np.int64),
+        highest.astype(np.int64),
+        int(np.ceil(grid.horizon_row)),
+    )
 
 
 def _edge_std(labels: Labels, grid: StripGrid) -> Array:
@@ -270,95 +289,3 @@ def _ranges(
         far = both & (apart > _APART * np.sqrt(1 / w_foot + 1 / w_match))
         std[far] = np.maximum(std[far], apart[far] / 2)
     return inverse, std
-
-
-@njit(nogil=True)
-def _spread(w: float, wv: float, wvv: float) -> float:
-    """Half the weighted squared deviation from the mean, of sums of weights, values and squares."""
-    return 0.5 * max(wvv - wv * wv / w, 0.0) if w > 0 else 0.0
-
-
-@njit(nogil=True)
-def cut_columns(
-    cost: Array,
-    weight: Array,
-    value: Array,
-    contact: Array,
-    contact_std: Array,
-    lowest: Any,
-    highest: Any,
-    horizon: int,
-) -> tuple[Any, Any]:
-    """The cheapest cut of every column (first axis). cost: (C, 3, R). weight, value: (C, R) of matched inverse
-    distances. contact, contact_std: (C, R + 1) inverse distance of a foot at each row edge. Rows `highest` to `lowest`
-    (excluded) are cut.
-
-    Returns counts (C,) and (C, R, 6): bottom, top, kind, inverse distance, its deviation (NaN: unknown), whether it
-    stands in water.
-    """
-    columns, _, rows = cost.shape
-    counts = np.zeros(columns, np.int64)
-    cut = np.zeros((columns, rows, 6))
-    for c in range(columns):
-        low, high = lowest[c], highest[c]
-        if low <= high:
-            continue
-        # sums over the rows below an edge: edge r is the upper side of row r
-        sums = np.zeros((3, rows + 1))
-        w, wv, wvv = np.zeros(rows + 1), np.zeros(rows + 1), np.zeros(rows + 1)
-        for r in range(low - 1, high - 1, -1):
-            for k in range(3):
-                sums[k, r] = sums[k, r + 1] + cost[c, k, r]
-            w[r] = w[r + 1] + weight[c, r]
-            wv[r] = wv[r + 1] + weight[c, r] * value[c, r]
-            wvv[r] = wvv[r + 1] + weight[c, r] * value[c, r] ** 2
-        best = np.full(
-            (3, rows + 1), np.inf
-        )  # of everything below an edge, its highest piece being of a kind
-        start = np.zeros((3, rows + 1), np.int64)
-        before = np.full((3, rows + 1), -1, np.int64)
-        for r in range(low - 1, high - 1, -1):
-            for e in range(r + 1, low + 1):  # the piece from edge e up to edge r
-                first = e == low
-                water, obstacle, sky = best[0, e], best[1, e], best[2, e]
-                if r >= horizon - _SLACK_ROWS:
-                    below = 0.0 if first else obstacle + _BEHIND_COST
-                    total = below + _PIECE_COST + sums[0, r] - sums[0, e]
-                    if total < best[0, r]:
-                        best[0, r], start[0, r], before[0, r] = total, e, (-1 if first else 1)
-                dw, dwv, dwvv = w[r] - w[e], wv[r] - wv[e], wvv[r] - wvv[e]
-                shared = _PIECE_COST + sums[1, r] - sums[1, e]
-                loose = shared + _spread(dw, dwv, dwvv)
-                below, kind = (0.0, -1) if first else (obstacle, 1)
-                if not first and sky + _OVERHEAD_COST < below:
-                    below, kind = sky + _OVERHEAD_COST, 2
-                if below + loose < best[1, r]:
-                    best[1, r], start[1, r], before[1, r] = below + loose, e, kind
-                if not first and water < best[1, r]:
-                    cw = 1 / contact_std[c, e] ** 2
-                    cv = contact[c, e]
-                    total = water + shared + _spread(dw + cw, dwv + cw * cv, dwvv + cw * cv * cv)
-                    if total < best[1, r]:
-                        best[1, r], start[1, r], before[1, r] = total, e, 0
-                if e <= horizon + _SLACK_ROWS:
-                    below, kind = (0.0, -1) if first else (min(water, obstacle), 0 if water < obstacle else 1)
-                    total = below + _PIECE_COST + sums[2, r] - sums[2, e]
-                    if total < best[2, r]:
-                        best[2, r], start[2, r], before[2, r] = total, e, kind
-        kind = int(np.argmin(best[:, high]))
-        r, n = high, 0
-        while kind >= 0 and r < low:
-            e, under = start[kind, r], before[kind, r]
-            piece = cut[c, n]
-            piece[0], piece[1], piece[2], piece[3], piece[4], piece[5] = e, r, kind, np.nan, np.nan, 0.0
-            if kind == 1:
-                dw, dwv = w[r] - w[e], wv[r] - wv[e]
-                if under == 0:
-                    cw = 1 / contact_std[c, e] ** 2
-                    dw, dwv, piece[5] = dw + cw, dwv + cw * contact[c, e], 1.0
-                if dw > 0:
-                    piece[3], piece[4] = dwv / dw, 1 / math.sqrt(dw)
-            r, kind, n = e, under, n + 1
-        cut[c, :n] = cut[c, :n][::-1].copy()
-        counts[c] = n
-    return counts, cut
