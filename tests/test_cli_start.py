@@ -4,14 +4,17 @@ named."""
 from __future__ import annotations
 
 import importlib.util
+import io
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import typer
+from rich.console import Console
 
 from cli_runs import run
+from rigwake.cli.console import figures_table
 from rigwake.cli.main import GROUPS, VERBS, build_app, main
 
 _HEAVY = ("numpy", "cv2", "scipy", "numba", "av")
@@ -75,3 +78,21 @@ def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         ended = run(*words)
         assert ended.code == 2
         assert "pip install 'rigwake[video]'" in ended.words
+
+
+@pytest.mark.parametrize("width", [80, 40, 24])
+def test_a_narrow_terminal_keeps_the_camera_and_every_figure(width: int) -> None:
+    table = figures_table(["camera", "rotation deg", "offset mm", "sigma deg", "sigma mm"])
+    rows = [
+        ["starboard_aft", "0.0123", "12.3", "0.0100", "4.0"],
+        ["front", "0.0456", "[red]78.9[/red]", "1", "2"],
+    ]
+    for row in rows:
+        table.add_row(*row)
+    console = Console(width=width, file=io.StringIO())
+    console.print(table)
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    assert max(map(len, shown.splitlines())) <= width
+    figures = [cell.replace("[red]", "").replace("[/red]", "") for row in rows for cell in row]
+    assert all(cell in shown for cell in figures)
+    assert shown.index("starboard_aft") < shown.index("0.0123") < shown.index("front") < shown.index("78.9")
