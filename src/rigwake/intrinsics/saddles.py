@@ -25,7 +25,7 @@ _FADE = 0.6  # standard deviation of the weights, as a fraction of half the wind
 _BLUR, _OFFSET, _CONTRAST = 4, 5, 6  # after the corner (2) and the directions of the two normals
 
 
-class _Fit(NamedTuple):
+class _SaddleFit(NamedTuple):
     params: Array  # (N, 7)
     jacobian: Array  # (N, K, 7), weighted
     residuals: Array  # (N, K), weighted
@@ -58,11 +58,11 @@ def _fit(values: Array, window: Array, weights: Array, start: Array, normals: li
     params = np.column_stack(
         [start, *normals, np.full(count, _START_BLUR_PX), np.zeros(count), np.ones(count)]
     )
-    shape = _evaluate(params, values, window, weights).jacobian[..., [_OFFSET, _CONTRAST]]
+    shape = _saddle_fit(params, values, window, weights).jacobian[..., [_OFFSET, _CONTRAST]]
     normal = np.einsum("nki,nkj->nij", shape, shape) + 1e-9 * np.eye(2)
     towards = np.einsum("nki,nk->ni", shape, weights * values)
     params[:, _OFFSET:] = np.linalg.solve(normal, towards[..., None])[..., 0]
-    fit = _evaluate(params, values, window, weights)
+    fit = _saddle_fit(params, values, window, weights)
     damping = np.full(count, 1e-3)
     for _ in range(_ROUNDS):
         normal = np.einsum("nki,nkj->nij", fit.jacobian, fit.jacobian)
@@ -71,9 +71,9 @@ def _fit(values: Array, window: Array, weights: Array, start: Array, normals: li
         towards = np.einsum("nki,nk->ni", fit.jacobian, fit.residuals)
         tried = fit.params + np.linalg.solve(normal, towards[..., None])[..., 0]
         tried[:, _BLUR] = tried[:, _BLUR].clip(*_BLUR_PX)
-        new = _evaluate(tried, values, window, weights)
+        new = _saddle_fit(tried, values, window, weights)
         better = (new.residuals**2).sum(axis=1) < (fit.residuals**2).sum(axis=1)
-        fit = _Fit(
+        fit = _SaddleFit(
             np.where(better[:, None], new.params, fit.params),
             np.where(better[:, None, None], new.jacobian, fit.jacobian),
             np.where(better[:, None], new.residuals, fit.residuals),
@@ -82,7 +82,7 @@ def _fit(values: Array, window: Array, weights: Array, start: Array, normals: li
     return fit.params[:, :2]
 
 
-def _evaluate(params: Array, values: Array, window: Array, weights: Array) -> _Fit:
+def _saddle_fit(params: Array, values: Array, window: Array, weights: Array) -> _SaddleFit:
     blur, contrast = params[:, _BLUR, None], params[:, _CONTRAST, None]
     away = window[None] - params[:, None, :2]
     edges, slopes, normals, along = [], [], [], []
@@ -105,4 +105,4 @@ def _evaluate(params: Array, values: Array, window: Array, weights: Array) -> _F
         product,
     ]
     residuals = values - params[:, _OFFSET, None] - contrast * product
-    return _Fit(params, np.stack(columns, axis=-1) * weights[None, :, None], residuals * weights)
+    return _SaddleFit(params, np.stack(columns, axis=-1) * weights[None, :, None], residuals * weights)
