@@ -22,7 +22,7 @@ def is_filled_up(encoded: bytes, image: Image) -> bool:
         return False
     end = encoded.rfind(_END)
     prolonged = encoded[:end] + _MORE + encoded[end:]
-    reduced = [
+    before, after = (
         cv2.imdecode(np.frombuffer(e, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8) for e in (encoded, prolonged)
-    ]
-    return not np.array_equal(*reduced)
+    )
+    return before is None or after is None or not np.array_equal(before, after)
