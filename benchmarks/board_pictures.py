@@ -4,7 +4,7 @@
 
 Each draw renders up to 24 chessboards through one known lens, finds their corners as the verb does and calibrates. Mean
 NEES per degree of freedom is 1 if the covariance is honest. blur: standard deviation of the lens's blur in pixels; 0
-makes pictures sharper than any lens does, whose corners are worse by half for want of grey values at the edges.
+makes pictures sharper than any lens does, whose corners are twice as bad for want of grey values at the edges.
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@ from typer.testing import CliRunner
 
 import tutorial_outputs
 from calibrated_rigs import PINHOLE, boat, without_vertical
-from cli_runs import commands_by_words
 from rigwake.calibration import load_calibration, save_calibration
 from rigwake.cameras.registry import camera_to_dict
 from rigwake.cli.main import build_app
@@ -224,24 +223,6 @@ def test_the_whole_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     for error in evaluate_calibration(found, rig_in_frame(truth, found.reference)).cameras.values():
         assert error.rotation_error_deg < 0.1
         assert error.translation_error_norm_m < 0.05
-
-
-def test_commands_in_the_documentation_exist() -> None:
-    verbs = commands_by_words()
-    pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-    commands = [(page.name, words) for page in pages for words in commands_of(page)]
-    assert len(commands) > 12
-    for page, (first, *rest) in commands:
-        two = f"{first} {rest[0]}" if rest else first
-        verb, words = (two, rest[1:]) if two in verbs else (first, rest)
-        assert verb in verbs, f"{page}: rigwake {verb}"
-        known = {
-            option
-            for parameter in verbs[verb].params
-            for option in (*parameter.opts, *parameter.secondary_opts)
-        }
-        used = {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)}
-        assert used <= known | {"--help"}, f"{page}: rigwake {verb} {used - known}"
 
 
 def test_every_page_is_in_the_site_and_linked_from_its_start() -> None:

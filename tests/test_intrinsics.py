@@ -22,6 +22,7 @@ from rigwake.intrinsics.board_observations import BoardObservations, BoardView, 
 from rigwake.intrinsics.board_pose import board_pose
 from rigwake.intrinsics.boards import Board, parse_board
 from rigwake.intrinsics.detect import detect_board, detect_corners
+from rigwake.intrinsics.saddles import fitted_saddles
 from rigwake.intrinsics.select import choose, cross_validate
 
 BOARD = parse_board("aprilgrid:6x6:0.088:0.3")
@@ -358,3 +359,23 @@ def test_charuco_corners_are_found_where_they_are() -> None:
     assert len(ids) == 24
     # 100 pixels per square; OpenCV's image has its own origin at the corner of the first pixel
     np.testing.assert_allclose(pixels, board.corner_points[ids, :2] * 2500 - 0.5, atol=0.3)
+
+
+@pytest.mark.parametrize(("blur_px", "within_px"), [(0.0, 0.02), (0.6, 0.008), (1.2, 0.015)])
+def test_corners_are_fitted_alike_in_sharp_and_soft_pictures(blur_px: float, within_px: float) -> None:
+    """Gradients are off by 0.03 px without blur, and by alike amounts over the view."""
+    camera = camera_from_params("pinhole", [420, 421, 162, 118, 0, -0.2, 0.05, 0, 0, 0], 320, 240)
+    board, rng = parse_board("chessboard:9x6:0.03"), np.random.default_rng(2)
+    cam_from_board = SE3(so3.exp([0.4, -0.3, 0.2]), np.array([0.01, 0.01, 0.5]))
+    image = render_board(camera, board, cam_from_board, rng, blur_px=blur_px)
+    truth, _ = camera.project(cam_from_board * centred_points(board))
+    start = truth + rng.uniform(-0.4, 0.4, truth.shape)
+    errors = fitted_saddles(image, start.reshape(board.rows, board.columns, 2)) - truth
+    assert np.sqrt(np.mean(errors**2)) < within_px
+    assert np.abs(errors.mean(axis=0)).max() < within_px / 3
+
+
+def test_corners_at_the_border_of_the_image_are_left_as_they_are() -> None:
+    grid = np.stack(np.meshgrid(np.arange(4) * 20.0 + 2, np.arange(3) * 20.0 + 30), axis=-1)
+    fitted = fitted_saddles(np.full((100, 100), 90, np.uint8), grid).reshape(3, 4, 2)
+    assert np.isnan(fitted[:, 0]).all()

@@ -251,6 +251,20 @@ def test_truncated_jpeg_is_left_out(tmp_path: Path) -> None:
     assert drain(recording) == 1
 
 
+@pytest.mark.parametrize("border", [0, 40, 128, 255])
+@pytest.mark.parametrize("colour", [False, True])
+def test_jpeg_that_ends_early_with_an_end_marker(border: int, colour: bool) -> None:
+    """Decoders fill such an image up; a picture that has a border of one value is whole, whichever value."""
+    image = cv2.GaussianBlur(np.random.default_rng(5).integers(0, 255, (96, 128, 3), np.uint8), (0, 0), 2)
+    image[64:] = border
+    whole = cv2.imencode(".jpg", image if colour else image[..., 0])[1].tobytes()
+    assert (decode_compressed(whole, colour=colour)[-1] == border).all()
+    for part in (0.3, 0.6, 0.9):
+        cut = whole[: int(part * len(whole))] + b"\xff\xd9"
+        with pytest.raises(InputError, match="cut off"):
+            decode_compressed(cut, colour=colour)
+
+
 def test_images_that_are_neither_jpeg_nor_png(tmp_path: Path) -> None:
     recording = stamped_bag(tmp_path, [START_NS], [b"RIFF0000WEBP"])
     assert has_finding(recording, "left out", "neither JPEG nor PNG")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pyproj import Transformer
 
 from rigwake.geometry import so3
 from rigwake.geometry.geodesy import enu_from_lla, lla_from_enu
@@ -194,6 +195,22 @@ def test_geodesy_round_trip(
     assert np.abs(enu_from_lla(there, origin)[0] - offset).max() < 1e-5
     assert np.abs(enu_from_lla([origin], origin)).max() < 1e-6
     assert enu_from_lla([(latitude, longitude, height + 3)], origin)[0] == pytest.approx([0, 0, 3], abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    "origin", [(0.0, 0.0, 0.0), (53.5, 9.9, 40.0), (-77.8, 166.7, 2800.0), (90.0, 0.0, 0.0)]
+)
+def test_geodesy_agrees_with_proj(origin: tuple[float, float, float]) -> None:
+    """To a micrometre over 200 km around."""
+    proj = Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 +step "
+        "+proj=topocentric +ellps=WGS84 +lat_0={!r} +lon_0={!r} +h_0={!r}".format(*origin)
+    )
+    position = np.random.default_rng(3).normal(size=(40, 3)) * [1e5, 1e5, 1e3]
+    there = lla_from_enu(position, origin)
+    by_proj = np.column_stack(proj.transform(there[:, 1], there[:, 0], there[:, 2]))
+    assert np.abs(by_proj - position).max() < 1e-6
+    assert np.abs(enu_from_lla(there, origin) - by_proj).max() < 1e-6
 
 
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=30))

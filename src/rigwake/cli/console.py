@@ -18,6 +18,7 @@ from rich.panel import Panel
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
 from rich.table import Table
+from rich.text import Text
 
 from rigwake.atomic import write_text_atomic
 from rigwake.errors import RigwakeError
@@ -122,12 +123,40 @@ def print_title(text: str) -> None:
     out.print(escape(text), style="bold", highlight=False, soft_wrap=True)
 
 
+class _FiguresTable(Table):
+    """A table that becomes a list, one figure a line under the name of its row, where it is wider than the terminal."""
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        if self._least_width(console) <= options.max_width:
+            yield from super().__rich_console__(console, options)
+            return
+        names, *figures = self.columns
+        for row, name in enumerate(names.cells):
+            yield name
+            for column in figures:
+                cell = list(column.cells)[row]
+                yield Text("  ").append_text(_styled(column.header)).append(" ").append_text(_styled(cell))
+
+    def _least_width(self, console: Console) -> int:
+        """The width at which no figure and no name of a row is cut; other words may be wrapped."""
+        cells = [[column.header, *column.cells] for column in self.columns]
+        wide = [[console.measure(_styled(cell)) for cell in column] for column in cells]
+        return -2 + sum(
+            2 + max(m.maximum if at == 0 or column.no_wrap else m.minimum for m in found)
+            for at, (column, found) in enumerate(zip(self.columns, wide, strict=True))
+        )
+
+
+def _styled(cell: RenderableType) -> Text:
+    return cell if isinstance(cell, Text) else Text.from_markup(str(cell))
+
+
 def figures_table(headings: Sequence[str], words: int = 1) -> Table:
-    """A table of figures that stays readable on 80 columns: no rules, no figure wrapped, units in the headings.
+    """A table of figures: no rules, no figure wrapped, units in the headings; a list where the terminal is narrower.
 
     words: how many columns from the left hold words; the rest holds figures, to the right.
     """
-    table = Table(box=None, pad_edge=False)
+    table = _FiguresTable(box=None, pad_edge=False)
     for index, heading in enumerate(headings):
         table.add_column(heading, justify="left" if index < words else "right", no_wrap=index >= words)
     return table

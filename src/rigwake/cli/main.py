@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 
 import typer
+from typer.completion import completion_init
 
 from rigwake import __version__
 from rigwake.cli.console import adapt_streams, err, print_error
@@ -67,15 +69,22 @@ def _root(
     """Calibrate a camera rig from the wake it leaves."""
 
 
-def build_app(verbs: Sequence[str] = (*VERBS, *GROUPS)) -> typer.Typer:
-    """The command-line application with these verbs and groups of verbs."""
+def build_app(
+    verbs: Sequence[str] = (*VERBS, *GROUPS), *, outline: bool = False, options: bool = True
+) -> typer.Typer:
+    """The command-line application with these verbs and groups of verbs.
+
+    outline: their names and what they do, without their options: what a list of verbs takes, and much quicker.
+    options: with those before the verb, such as --help. Where the shell completes a verb they only take time.
+    """
     app = typer.Typer(
         name="rigwake",
         no_args_is_help=True,
         rich_markup_mode="rich",
         pretty_exceptions_enable=False,
-        context_settings={"help_option_names": ["--help", "-h"]},
+        context_settings={"help_option_names": ["--help", "-h"] if options else []},
         epilog=EXIT_CODES,
+        add_completion=options,
     )
     app.callback()(_root)
     for verb in verbs:
@@ -83,8 +92,15 @@ def build_app(verbs: Sequence[str] = (*VERBS, *GROUPS)) -> typer.Typer:
         if verb in GROUPS:
             app.add_typer(_group(module.COMMANDS, module.__doc__ or ""), name=verb)
         else:
-            app.command(verb, epilog=EXIT_CODES)(module.command)
+            app.command(verb, epilog=EXIT_CODES)(_outlined(module.command) if outline else module.command)
     return app
+
+
+def _outlined(command: Callable[..., None]) -> Callable[[], None]:
+    def without_options() -> None: ...
+
+    without_options.__doc__ = command.__doc__
+    return without_options
 
 
 def _group(commands: Mapping[str, Callable[..., None]], help_text: str) -> typer.Typer:
@@ -134,8 +150,17 @@ def _run(words: list[str]) -> int:
     try:
         _say_where_kernels_are(words)
         known = (*VERBS, *GROUPS)
-        only = words[:1] if words and words[0] in known else known  # the others need not be imported
-        build_app(only)(words, prog_name="rigwake")
+        line = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS") or ""  # by which shell
+        is_completing = "_RIGWAKE_COMPLETE" in os.environ
+        typed = line.split()[1:] if is_completing else words
+        if typed and typed[0] in known:
+            app = build_app(typed[:1])  # the others need not be imported
+        else:
+            is_option = bool(typed) and typed[0].startswith("-")
+            app = build_app(outline=True, options=is_option or not is_completing)
+        if is_completing:
+            completion_init()  # the shells' own forms, which typer otherwise loads with the options
+        app(words, prog_name="rigwake")
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else int(bool(ended.code))
     return 0

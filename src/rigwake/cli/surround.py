@@ -21,6 +21,7 @@ from rigwake.cli.options import (
     require_writable,
 )
 from rigwake.errors import UsageError
+from rigwake.extras import require_extra
 
 if TYPE_CHECKING:
     from rigwake.views.prepare import SurroundSetup
@@ -117,6 +118,7 @@ def command(
     outline = _two_numbers(vessel, "--vessel") if vessel else None
     topic_map = TopicMap.from_options(topic or (), topics, camera_file or ())
     if live:
+        require_extra("av", "video", "Showing live sources")
         from rigwake.views.live import serve_live
 
         shown_port = _PORT if port is None else port
@@ -173,6 +175,8 @@ def _check_use(
             f"{output}: what should {output.suffix} be?",
             remedy=f"Write {', '.join((*_PICTURES, *_VIDEOS))}, or a folder without a suffix.",
         )
+    if output.suffix.lower() in _VIDEOS:
+        require_extra("av", "video", "Writing a video")
 
 
 def _two_numbers(text: str, option: str) -> tuple[float, float]:

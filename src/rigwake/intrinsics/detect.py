@@ -16,6 +16,7 @@ from rigwake._types import Array
 from rigwake.errors import EstimationError, UsageError
 from rigwake.intrinsics.board_observations import MIN_CORNERS, BoardObservations, BoardView, gathered
 from rigwake.intrinsics.boards import Board
+from rigwake.intrinsics.saddles import fitted_saddles
 from rigwake.readers.picture_files import IMAGE_SUFFIXES, picture_or_none
 
 Grey = NDArray[np.uint8]
@@ -44,19 +45,24 @@ def _chessboard(board: Board, image: Grey) -> Found:
 
 
 def _refined_saddles(image: Grey, grid: Array) -> Array:
-    """(N, 2) corners of a chessboard, given as (rows, columns, 2), where the gradients around them meet.
+    """(N, 2) corners of a chessboard, given as (rows, columns, 2), where the edges around them cross.
 
     `findChessboardCornersSB` fits a polynomial to what it filtered: on rendered boards its corners are off by 0.06 px
-    and by alike amounts over a whole view, which no covariance of independent corners explains; refined in windows that
-    hold one corner each, they are off by half of that and by a quarter over a view.
+    and by alike amounts over a whole view, which no covariance of independent corners explains. Gradients in windows
+    that hold one corner each halve that, edges fitted in them (`fitted_saddles`) bring it to a quarter and less.
     """
     sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
     half = int(np.clip(round(_WINDOW_OF_SQUARE * min(sides)), 2, 10))
     start = grid.reshape(-1, 1, 2).astype(np.float32)
     refined = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), _SUBPIXEL_STOP)
-    refined = np.asarray(refined, dtype=np.float64).reshape(-1, 2)
-    kept = np.linalg.norm(refined - grid.reshape(-1, 2), axis=1) <= _FARTHEST_REFINEMENT_PX
-    return np.where(kept[:, None], refined, grid.reshape(-1, 2))
+    refined = _unless_far(np.asarray(refined, dtype=np.float64).reshape(-1, 2), grid.reshape(-1, 2))
+    return _unless_far(fitted_saddles(image, refined.reshape(grid.shape)), refined)
+
+
+def _unless_far(refined: Array, before: Array) -> Array:
+    """The refined corners, but those before where refinement went astray or found nothing."""
+    is_near = np.linalg.norm(refined - before, axis=1) <= _FARTHEST_REFINEMENT_PX  # NaN is not
+    return np.where(is_near[:, None], refined, before)
 
 
 @lru_cache(maxsize=4)

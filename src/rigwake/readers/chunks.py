@@ -6,7 +6,6 @@ Where chunks are not compressed a message, or only its first bytes, is read stra
 from __future__ import annotations
 
 import bz2
-import io
 import os
 import struct
 import zlib
@@ -17,12 +16,12 @@ from typing import Literal, NamedTuple
 
 import lz4.frame
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
 from rigwake.errors import InputError
 from rigwake.readers.channels import MAX_MESSAGE_BYTES
 from rigwake.readers.clock_steps import set_back_rows
+from rigwake.readers.zstandard_frames import ZstdError, unpack_zstd
 
 Framing = Literal["ros1", "mcap"]
 
@@ -91,11 +90,8 @@ def _unpacked(stored: bytes, chunk: Chunk) -> bytes:
             case "bz2":
                 return bz2.BZ2Decompressor().decompress(stored, chunk.content_bytes)
             case "zstd":
-                with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(
-                    io.BytesIO(stored)
-                ) as reader:
-                    return bytes(reader.read(chunk.content_bytes))
-    except (RuntimeError, OSError, EOFError, ValueError, zstandard.ZstdError) as error:
+                return unpack_zstd(stored, chunk.content_bytes)
+    except (RuntimeError, OSError, EOFError, ValueError, ZstdError) as error:
         raise InputError(f"A chunk cannot be unpacked ({error}).") from error
     raise InputError(f"Chunk compression {chunk.compression!r} is unknown.")
 

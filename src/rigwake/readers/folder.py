@@ -11,6 +11,7 @@ from rigwake._types import Stamps
 from rigwake.cameras.formats.camera_files import read_cameras
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import CameraError, InputError
+from rigwake.extras import require_extra
 from rigwake.readers.csv_sensors import read_attitude_csv, read_gnss_csv, read_imu_csv
 from rigwake.readers.frame_lists import LIST_ENDINGS, frames_of_folder, read_frame_list
 from rigwake.readers.image_files import file_frames, image_files
@@ -21,7 +22,6 @@ from rigwake.readers.picture_files import swaps_sides
 from rigwake.readers.rig_file import read_rig_file
 from rigwake.readers.streams import time_order
 from rigwake.readers.trajectories import read_trajectory
-from rigwake.readers.video_files import VIDEO_SUFFIXES, VideoFrames, index_video
 from rigwake.recording import (
     AttitudeStream,
     CameraStream,
@@ -34,6 +34,9 @@ from rigwake.recording import (
 from rigwake.rig import Rig
 from rigwake.trajectory import Trajectory
 
+VIDEO_SUFFIXES = frozenset(
+    {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp"}
+)
 _TABLES = {"imu": "imu", "gnss": "gnss", "gps": "gnss", "attitude": "attitude"}
 _TABLE_NAME = re.compile(r"(imu|gnss|gps|attitude)\d*(?:[_-].*)?")
 _TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".dat")
@@ -225,6 +228,9 @@ def _add_camera(
 
 
 def _add_video(path: Path, found: _FolderStreams) -> None:
+    require_extra("av", "video", f"Reading {path.name}")
+    from rigwake.readers.video_files import VideoFrames, index_video
+
     name = _free_name(path, found.cameras, found)
     index = index_video(path)
     stamps = index.stamps_ns()

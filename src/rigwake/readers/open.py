@@ -11,7 +11,7 @@ from rigwake.excerpt import longest_stretch
 from rigwake.readers.channels import BagIndex
 from rigwake.readers.clock_steps import on_one_clock
 from rigwake.readers.euroc_folder import euroc_root, read_euroc
-from rigwake.readers.folder import is_plain_folder, read_folder, read_video
+from rigwake.readers.folder import VIDEO_SUFFIXES, is_plain_folder, read_folder, read_video
 from rigwake.readers.kitti import is_kitti_odometry, is_kitti_raw, read_kitti_odometry, read_kitti_raw
 from rigwake.readers.lens_choice import with_chosen_lenses
 from rigwake.readers.mcap_file import MAGIC as MCAP_MAGIC
@@ -30,7 +30,6 @@ from rigwake.readers.rosbag2 import (
     is_rosbag2_folder,
 )
 from rigwake.readers.topics import TopicMap
-from rigwake.readers.video_files import VIDEO_SUFFIXES
 from rigwake.recording import Finding, Recording
 from rigwake.text_files import require_file
 

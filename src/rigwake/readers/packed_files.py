@@ -19,23 +19,19 @@ from pathlib import Path
 from typing import IO, cast
 
 import lz4.frame
-import zstandard
 
 from rigwake.errors import InputError
 from rigwake.readers.channels import require_regular_file
 from rigwake.readers.chunks import FREE_BYTES, MAX_RATIO
+from rigwake.readers.zstandard_frames import MAGIC as ZSTD_MAGIC
+from rigwake.readers.zstandard_frames import ZstdError, open_zstd
 
 _BLOCK_BYTES = 2**20
 _KEPT_FREE_BYTES = 2**28  # of the disk that holds temporary files
 
 
-def _open_zstd(file: IO[bytes]) -> IO[bytes]:
-    unpacker = zstandard.ZstdDecompressor(max_window_size=2**27)
-    return cast("IO[bytes]", unpacker.stream_reader(file, read_across_frames=True))
-
-
 _OPENERS: dict[bytes, tuple[str, Callable[[IO[bytes]], IO[bytes]]]] = {
-    b"\x28\xb5\x2f\xfd": ("zstd", _open_zstd),
+    ZSTD_MAGIC: ("zstd", open_zstd),
     b"\x1f\x8b": ("gzip", lambda file: cast("IO[bytes]", gzip.GzipFile(fileobj=file))),
     b"BZh": ("bzip2", lambda file: cast("IO[bytes]", bz2.BZ2File(file))),
     b"\xfd7zXZ\x00": ("xz", lambda file: cast("IO[bytes]", lzma.LZMAFile(file))),  # noqa: SIM115
@@ -88,7 +84,7 @@ def _unpacked_once(path: Path, stored_bytes: int, _modified_ns: int) -> tuple[Pa
             RuntimeError,
             lzma.LZMAError,
             zlib.error,
-            zstandard.ZstdError,
+            ZstdError,
         ) as error:
             problem = f"{path.name} is cut off or damaged ({error}); what could be unpacked is kept."
     if not written:

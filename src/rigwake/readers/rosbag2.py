@@ -11,7 +11,6 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
-import zstandard
 
 from rigwake._types import Stamps
 from rigwake.errors import InputError
@@ -30,13 +29,14 @@ from rigwake.readers.mcap_file import MAGIC as MCAP_MAGIC
 from rigwake.readers.mcap_file import index_mcap
 from rigwake.readers.packed_files import PACKED_SUFFIXES, packing_of, private_copy, unpacked_file
 from rigwake.readers.printable import printable
+from rigwake.readers.zstandard_frames import MAGIC as ZSTD_MAGIC
+from rigwake.readers.zstandard_frames import ZstdError, unpack_zstd
 from rigwake.recording import Finding
 from rigwake.yaml_input import read_yaml
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 METADATA = "metadata.yaml"
 _STORAGE_SUFFIXES = (".db3", ".mcap")
-_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _MAX_METADATA_BYTES = 2**24
 
 
@@ -73,12 +73,11 @@ class PackedPayloads:
 def _unpacked(stored: bytes, limit_bytes: int) -> bytes:
     """Up to `limit_bytes` of the content; empty if it is damaged, or far larger than its packed size allows."""
     limit = min(limit_bytes, FREE_BYTES // 4 + MAX_RATIO * len(stored))
-    if not stored.startswith(_ZSTD_MAGIC):
+    if not stored.startswith(ZSTD_MAGIC):
         return stored[:limit_bytes]
     try:
-        with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(stored) as reader:
-            return bytes(reader.read(limit))
-    except zstandard.ZstdError:
+        return unpack_zstd(stored, limit)
+    except ZstdError:
         return b""
 
 
@@ -87,7 +86,7 @@ def with_packed_messages(bag: BagIndex) -> BagIndex:
     channels = []
     for channel in bag.channels:
         first = next(iter(channel.payloads.read(range(min(len(channel), 1)), 4)), b"")
-        if channel.encoding == "cdr" and first == _ZSTD_MAGIC:
+        if channel.encoding == "cdr" and first == ZSTD_MAGIC:
             channel = replace(channel, payloads=PackedPayloads(channel.payloads))
         channels.append(channel)
     return replace(bag, channels=tuple(channels))

@@ -21,9 +21,6 @@ from rigwake.readers.images import ImageSize, checked_size
 from rigwake.recording import Frame
 from rigwake.text_files import require_file
 
-VIDEO_SUFFIXES = frozenset(
-    {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp"}
-)
 _FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,avi,matroska,webm,mpegts,mpeg,asf"
 # PyAV passes on what damaged files make FFmpeg say; its own wrappers stumble over some of it
 _UNREADABLE = (av.error.FFmpegError, UnicodeDecodeError, AttributeError, ValueError, IndexError)

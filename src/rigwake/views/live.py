@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-import av
 import numpy as np
 
 from rigwake._types import Image
@@ -77,6 +76,8 @@ class LiveCamera(threading.Thread):
 
     def run(self) -> None:
         """Decode until stopped."""
+        import av  # an extra: pairing pictures of other sources goes without it
+
         while not self._stopped.is_set():
             try:
                 self._play()
@@ -90,6 +91,8 @@ class LiveCamera(threading.Thread):
         return Path(self._url).is_file()
 
     def _play(self) -> None:
+        import av
+
         is_file, is_device = self._is_file(), self._url.startswith("/dev/")
         form = "v4l2" if is_device else None
         options = {} if is_file or is_device else _OPTIONS

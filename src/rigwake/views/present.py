@@ -11,6 +11,7 @@ import numpy as np
 from rigwake._types import Image
 from rigwake.calibration import Calibration
 from rigwake.errors import InputError
+from rigwake.extras import require_extra
 from rigwake.views.attitude import LevelAttitude
 from rigwake.views.blend import blended_still
 from rigwake.views.colour import GainSmoother
@@ -20,7 +21,6 @@ from rigwake.views.prepare import SurroundSetup, require_pictures
 from rigwake.views.projections import Bowl, CylinderView, EquirectangularView, TopDown, ViewProjection
 from rigwake.views.surface import Surface
 from rigwake.views.surround_view import SurroundView
-from rigwake.views.video import video_file
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,9 @@ def write_video(
 
     Frame sets of which every camera is missing are left out. Raises InputError if that is so for all.
     """
+    require_extra("av", "video", "Writing a video")
+    from rigwake.views.video import video_file
+
     times = setup.times_ns()
     if start_s is not None:
         times = times[(times - times[0]) * 1e-9 >= start_s - 1e-6]
