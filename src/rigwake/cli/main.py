@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 
 import typer
-from typer.completion import completion_init
+from typer._completion_classes import completion_init
 
 from rigwake import __version__
 from rigwake.cli.console import adapt_streams, err, print_error

@@ -40,7 +40,7 @@ def fitted_saddles(image: NDArray[np.uint8], grid: Array) -> Array:
     steps = np.arange(-half, half + 1)
     window = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     size = np.array(image.shape[1::-1])
-    inside = ((nearest >= half) & (nearest < size - half)).all(axis=1)
+    inside = np.all((nearest >= half) & (nearest < size - half), axis=1)
     pixels = (nearest[:, None] + window).clip(0, size - 1)
     values = image[pixels[..., 1], pixels[..., 0]].astype(np.float64)
     normals = [
