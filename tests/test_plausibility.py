@@ -21,7 +21,7 @@ from rigwake.plausibility.receiver_checks import vet_receiver
 from rigwake.plausibility.receiver_fit import ReceiverFit, fit_receiver, level_path
 from rigwake.plausibility.turn_checks import check_clocks, check_mounts, check_scale
 from rigwake.plausibility.turn_fit import TurnFit, camera_as_gyroscope, fit_turns
-from rigwake.plausibility.values import SensorCheck, checks_from_list, checks_to_list, disagreeing, refuse
+from rigwake.plausibility.values import SensorCheck, checks_to_list, disagreeing, refuse
 from rigwake.recording import GnssStream, ImuStream
 from rigwake.simulation.tracks_only import SimulatedTracks
 from rigwake.tracks import TrackingReport, Tracks
@@ -349,7 +349,8 @@ def test_refusing_names_sensor_and_remedy_and_checks_survive_their_file() -> Non
     )
     with pytest.raises(InputError, match=r"gnss gps: it is stuck.*Restart it"):
         refuse(checks)
-    again = checks_from_list(checks_to_list(checks))
-    assert again[1] == checks[1]
-    assert np.isnan(again[0].expected)
+    stuck, held = checks_to_list(checks)
+    assert SensorCheck(**held) == checks[1]
+    assert stuck["expected"] is None
+    assert stuck["hypothesis"] == "it is stuck."
     refuse(checks[1:])
