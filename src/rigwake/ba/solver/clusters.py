@@ -1,9 +1,9 @@
 """What errors that last along a track do to the shared parameters.
 
 The information matrix takes every observation's error to be independent. Those of one landmark are not: a patch
-that is drawn otherwise than its warp supposes errs the same way for seconds. The scores `u_l = G_l^T r_l` of whole
-landmarks (G: how its observations pull at the shared parameters, everything else adjusting to it) are independent of
-each other, whatever happens within a track, and their scatter says how large the errors really are:
+that is drawn otherwise than its warp supposes errs the same way for seconds. The scores `u_l = G_l^T (I - H_l) r_l`
+of whole landmarks (G: how its observations pull at the shared parameters, everything else adjusting to it) are
+independent of each other, whatever happens within a track, and their scatter says how large the errors really are:
 
     sum_l u_l u_l^T   against   sum_l G_l^T (I - H_l) G_l,   H_l the hat matrix of the landmark's own position,
 
@@ -59,13 +59,19 @@ def clustered_scatter(
             G += observations.by_extras[rows] @ score[index]
         own = starts[first : last + 1] - rows.start
         own = own[:-1][np.diff(own) > 0]
-        scores = np.add.reduceat(np.einsum("mik,mi->mk", G, observations.residuals[rows]), own, axis=0)
-        observed += scores.T @ scores
+        residuals = observations.residuals[rows]
+        scores = np.add.reduceat(np.einsum("mik,mi->mk", G, residuals), own, axis=0)
         J = observations.by_landmark[rows]
         cross = np.add.reduceat(np.einsum("mia,mik->mak", J, G), own, axis=0)
         block = np.add.reduceat(np.einsum("mia,mib->mab", J, J), own, axis=0)
         block += _RIDGE * np.einsum("laa->l", block)[:, None, None] * np.eye(3) + 1e-300 * np.eye(3)
-        taken = np.einsum("lak,laj->kj", cross, np.linalg.solve(block, cross))
+        solved = np.linalg.solve(block, cross)
+        taken = np.einsum("lak,laj->kj", cross, solved)
+        # nothing at the optimum; a landmark that is not there yet would pull as if its residuals scattered so
+        scores -= np.einsum(
+            "lak,la->lk", solved, np.add.reduceat(np.einsum("mia,mi->ma", J, residuals), own, axis=0)
+        )
+        observed += scores.T @ scores
         predicted += np.einsum("mik,mij->kj", G, G, optimize=True) - taken
     return weight * observed, weight * predicted
 
