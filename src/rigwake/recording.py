@@ -141,7 +141,7 @@ class Finding:
     severity: str
     sensor: str
     message: str
-    is_guess: bool = False
+    is_guess: bool = field(default=False, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)
