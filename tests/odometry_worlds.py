@@ -104,10 +104,13 @@ def sensors_of(seconds: float = 30.0, seed: int = 0) -> tuple[ImuStream, GnssStr
     R = path.rotation[1:-1]
     force = np.einsum("nji,nj->ni", R, spline.acceleration_world(stamps) + np.array([0, 0, 9.81]))
     n = len(stamps)
+    half_ns = 1_000_000
+    before, after = spline.at(stamps - half_ns).rotation, spline.at(stamps + half_ns).rotation
+    rates = so3.log(np.swapaxes(before, 1, 2) @ after) / (2e-9 * half_ns)
     imu = ImuStream(
         "imu",
         stamps,
-        spline.angular_rate_body(stamps) + GYRO_BIAS + rng.normal(0, 1.5e-3, (n, 3)),
+        rates + GYRO_BIAS + rng.normal(0, 1.5e-3, (n, 3)),
         force + ACCEL_BIAS + rng.normal(0, 0.02, (n, 3)),
     )
     fixes = stamps[::20]

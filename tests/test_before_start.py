@@ -29,6 +29,7 @@ from rigwake.pipeline.camera_stage import load_outcome
 from rigwake.pipeline.prior import Baseline, RigPrior, load_prior
 from rigwake.pipeline.stage_files import StageLedger
 from rigwake.pipeline.stream_selection import select
+from rigwake.readers.imu_units import accel_in_si
 from rigwake.recording import CameraStream, ImuStream, Recording
 from rigwake.report.report_verdict import judge
 from rigwake.tracks import load_tracks
@@ -55,6 +56,19 @@ def recording(**fields: object) -> Recording:
     return Recording(
         **({"path": Path("sail.bag"), "kind": "ros1", "cameras": cameras, "imus": {"imu": IMU}} | fields)
     )
+
+
+def test_a_unit_that_was_guessed_at_reading_is_refused_without_repair() -> None:
+    level = np.tile([0.0, 0.0, 1.0], (100, 1))
+    for unit, is_guess in (("", True), ("m/s^2", True), ("g", False)):
+        _, said = accel_in_si(level, unit, "imu")
+        guessed = recording(findings=tuple(said))
+        assert select(guessed, load_config(None, ())).imu is not None
+        if not is_guess:
+            assert select(guessed, load_config(None, ("repair=false",))).imu is not None
+            continue
+        with pytest.raises(InputError, match=r"imu: .* g\b.*Name the unit"):
+            select(guessed, load_config(None, ("repair=false",)))
 
 
 def checked_reference(wanted: str, **fields: object) -> None:

@@ -20,7 +20,7 @@ from rigwake.errors import UnobservableError, UsageError
 from rigwake.evaluation.trajectory_errors import absolute_error
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
-from rigwake.odometry.gnss import align_gnss, in_enu
+from rigwake.odometry.gnss import align_gnss
 from rigwake.odometry.gravity_alignment import up_in_camera
 from rigwake.odometry.gyro import align_gyro, camera_rotations, integrate_gyro
 from rigwake.odometry.imu_alignment import align_inertial
@@ -90,9 +90,8 @@ def test_gnss_gives_scale_world_and_antenna_and_gates_wild_fixes(sensors):
     error = found.antenna_cam - antenna_cam
     assert error @ np.linalg.solve(found.covariance[7:, 7:], error) < 16.3
     truth = rig_path().world_from_body * RIG_FROM_CAM
-    metric = in_enu(visual, found)
-    assert metric.is_metric
-    assert np.linalg.norm(metric.world_from_body.translation - truth.translation, axis=1).max() < 0.1
+    metric = found.enu_from_visual.apply(visual.world_from_body)
+    assert np.linalg.norm(metric.translation - truth.translation, axis=1).max() < 0.1
 
 
 def test_gnss_on_a_straight_line_is_refused(sensors):

@@ -21,8 +21,9 @@ from rigwake.plausibility.receiver_checks import vet_receiver
 from rigwake.plausibility.receiver_fit import ReceiverFit, fit_receiver, level_path
 from rigwake.plausibility.turn_checks import check_clocks, check_mounts, check_scale
 from rigwake.plausibility.turn_fit import TurnFit, camera_as_gyroscope, fit_turns
-from rigwake.plausibility.values import SensorCheck, checks_from_list, checks_to_list, disagreeing, refuse
+from rigwake.plausibility.values import SensorCheck, checks_to_list, disagreeing, refuse
 from rigwake.recording import GnssStream, ImuStream
+from rigwake.simulation.sensors import gauss_markov
 from rigwake.simulation.tracks_only import SimulatedTracks
 from rigwake.tracks import TrackingReport, Tracks
 from rigwake.trajectory import Trajectory
@@ -250,6 +251,18 @@ def test_exchanged_coordinates_are_named() -> None:
     assert ned.gnss is None
 
 
+def test_fixes_that_run_away_steadily_are_named_and_those_that_wander_are_not() -> None:
+    seconds = (gnss().timestamps_ns - gnss().timestamps_ns[0])[:, None] * 1e-9
+    away = vetted(replace(gnss(), position_enu=gnss().position_enu + seconds * [0.0, 0.2, 0.0]))
+    assert away.gnss is None
+    assert "run away from the cameras' path by 0.20 m/s" in wrong(away.checks)["gnss gnss"]
+    for seed in range(4):
+        lasting = gauss_markov(np.random.default_rng(seed), len(seconds), 0.2, 1.0, 40.0)
+        stated = np.tile(np.eye(3) * 1.06, (len(seconds), 1, 1))
+        wandering = replace(gnss(), position_enu=gnss().position_enu + lasting, covariances=stated)
+        assert not wrong(vetted(wandering).checks)
+
+
 @pytest.mark.parametrize("late_s", [0.2, 1.0, -0.5])
 def test_the_delay_of_a_receiver_is_measured(late_s: float) -> None:
     found = vetted(replace(gnss(), timestamps_ns=gnss().timestamps_ns + round(late_s * 1e9)))
@@ -349,7 +362,8 @@ def test_refusing_names_sensor_and_remedy_and_checks_survive_their_file() -> Non
     )
     with pytest.raises(InputError, match=r"gnss gps: it is stuck.*Restart it"):
         refuse(checks)
-    again = checks_from_list(checks_to_list(checks))
-    assert again[1] == checks[1]
-    assert np.isnan(again[0].expected)
+    stuck, held = checks_to_list(checks)
+    assert SensorCheck(**held) == checks[1]
+    assert stuck["expected"] is None
+    assert stuck["hypothesis"] == "it is stuck."
     refuse(checks[1:])

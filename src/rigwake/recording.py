@@ -133,11 +133,15 @@ class AttitudeStream:
 
 @dataclass(frozen=True)
 class Finding:
-    """Something noticed while reading: what, about which sensor, how bad (`note`, `warning`, `error`)."""
+    """Something noticed while reading: what, about which sensor, how bad (`note`, `warning`, `error`).
+
+    is_guess: whether values were converted by a guess at their unit, which runs without repairs refuse.
+    """
 
     severity: str
     sensor: str
     message: str
+    is_guess: bool = field(default=False, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)

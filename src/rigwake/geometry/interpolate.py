@@ -80,10 +80,6 @@ class TransformSpline:
         """(M, 3) accelerations in the world, metres per second squared."""
         return np.asarray(self._curves[0](self._times(at_ns), 2))
 
-    def angular_rate_body(self, at_ns: Stamps) -> Array:
-        """(M, 3) angular rates in body axes, radians per second."""
-        return np.asarray(self._curves[1](self._times(at_ns), 1))
-
 
 def nearest_indices(times: NDArray[Any], at: NDArray[Any]) -> Indices:
     """(n,) index of the time (N,), in rising order, nearest to each of `at` (n,); the later one of two alike."""

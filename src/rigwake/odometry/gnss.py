@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,14 +151,4 @@ def _unobservable(name: str) -> UnobservableError:
     return UnobservableError(
         f"{name}: its path is too short or too straight for GNSS to tell scale and direction.",
         remedy="Sail a longer stretch with a turn.",
-    )
-
-
-def in_enu(trajectory: Trajectory, alignment: GnssAlignment) -> Trajectory:
-    """The segment in metres, in the ENU world. Covariances are dropped: they were in the visual unit."""
-    return replace(
-        trajectory,
-        world_from_body=alignment.enu_from_visual.apply(trajectory.world_from_body),
-        covariances=None,
-        is_metric=True,
     )

@@ -65,7 +65,7 @@ class OdometryRun:
     @property
     def lens_checks(self) -> list[SensorCheck]:
         """Lenses that do not fit their own tracks: worth a word, but a path by them is not worthless."""
-        return [c for c in self.checks if not c.agrees and "lens" in c.hypothesis]
+        return [c for c in self.checks if not c.agrees and c.part == "lens"]
 
     def refuse_contradicted(self) -> None:
         """Raises InputError where sensors, lenses aside, contradict each other."""

@@ -53,8 +53,8 @@ class FrameWindow:
 def select(recording: Recording, config: CalibrateConfig) -> Selection:
     """Apply `cameras`, `start_s`, `duration_s`, `imu` and `gnss` of the settings.
 
-    Raises InputError without cameras or intrinsics, UsageError for unknown names, UnobservableError when the
-    stretch is too short to tell anything.
+    Raises InputError without cameras or intrinsics, or where a unit was guessed and no repair is wanted, UsageError for
+    unknown names, UnobservableError when the stretch is too short to tell anything.
     """
     names = config.cameras or tuple(recording.cameras)
     cameras = {name: recording.camera(name) for name in names}
@@ -79,6 +79,8 @@ def select(recording: Recording, config: CalibrateConfig) -> Selection:
         for f in recording.findings
         if f.severity != "note"
     ]
+    if config.imu and not config.repair:
+        _refuse_guesses(recording)
     imu = _one("IMU", main_imu(recording), recording.imus, config.imu, notes)
     gnss = _one("GNSS receiver", main_gnss(recording), recording.gnss, config.gnss, notes)
     notes.extend(
@@ -100,6 +102,17 @@ def select(recording: Recording, config: CalibrateConfig) -> Selection:
         )
     known = None if imu is None else _with_noise(imu, config, notes)
     return Selection(windowed, known, gnss, tuple(notes), left_out)
+
+
+def _refuse_guesses(recording: Recording) -> None:
+    """Raise InputError where an IMU's unit was guessed at reading."""
+    for finding in recording.findings:
+        if finding.is_guess and finding.sensor in recording.imus:
+            raise InputError(
+                f"{finding.sensor}: {finding.message}",
+                consequence="A unit that was guessed is a repair, and none is wanted.",
+                remedy="Name the unit in the header of the table, or allow repairs.",
+            )
 
 
 _Sensor = TypeVar("_Sensor", ImuStream, GnssStream)

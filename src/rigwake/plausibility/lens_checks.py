@@ -60,7 +60,7 @@ def check_lenses(
         lens = models[name]
         quantity = "focal length by its tracks over that given"
         if not is_off(fit, lens.width_px):
-            checks.append(SensorCheck(f"camera {name}", True, fit.scale, 1.0, quantity=quantity))
+            checks.append(SensorCheck(f"camera {name}", True, fit.scale, 1.0, quantity=quantity, part="lens"))
             continue
         std = np.sqrt(np.diag(fit.covariance))
         words = (
@@ -71,7 +71,9 @@ def check_lenses(
         cause = _turned_picture(fit, lens) or _another_lens(name, tracks, models, trajectories)
         remedy = "Give its own lens at this resolution and focus (`rigwake intrinsics` finds it)."
         hypothesis = f"{words}; {cause}." if cause else f"{words}."
-        checks.append(SensorCheck(f"camera {name}", False, fit.scale, 1.0, hypothesis, remedy, quantity))
+        checks.append(
+            SensorCheck(f"camera {name}", False, fit.scale, 1.0, hypothesis, remedy, quantity, part="lens")
+        )
     return tuple(checks)
 
 

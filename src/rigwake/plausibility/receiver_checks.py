@@ -25,6 +25,7 @@ _DRIFT = 0.01  # of the path: what a camera's own path may be off
 _DRIFT_WITHOUT_IMU = 0.12  # the same of vision alone, whose scale and heading wander
 _STDS = 4.0
 _CLEARLY_BETTER = 0.35
+_RAN_AWAY = 0.6  # what a drift leaves of the residuals, at most, to count as one
 _DELAY_S, _DELAY_SIGMAS, _DELAY_KNOWN_S = 0.05, 4.0, 0.15
 _OUTLIER_STDS = 8.0
 _LEAST_JUMP_M, _JUMP_STDS = 0.5, 8.0
@@ -84,6 +85,8 @@ def vet_receiver(
         )
         check = SensorCheck(sensor, False, fit.rms, expected, f"{words}.", remedy, quantity)
         return VettedReceiver(None, 0.0, fit, (*checks, check))
+    if level and (away := _running_away(gnss, path, time_offset_s, fit)) is not None:
+        return VettedReceiver(None, 0.0, fit, (*checks, away))
     ratio = 1.0 if inertial_scale is None else fit.scale / inertial_scale[0]
     if inertial_scale is not None and abs(ratio - 1) > inertial_scale[1] + 5 * fit.scale_std:
         words = f"its distances are {ratio:.3f} times those by the accelerometer."
@@ -113,6 +116,24 @@ def _expected(gnss: GnssStream, fit: ReceiverFit, level: bool) -> float:
     """
     stated = float(np.sqrt(np.median(gnss.covariances[:, [0, 1], [0, 1]])))
     return _STDS * stated + (_DRIFT if level else _DRIFT_WITHOUT_IMU) * fit.path_m + 0.1
+
+
+def _running_away(
+    gnss: GnssStream, path: Trajectory, time_offset_s: float, given: ReceiverFit
+) -> SensorCheck | None:
+    """What is wrong with fixes that run away from the path steadily, by more than both may drift; else None.
+
+    Heading, scale and delay of the path give way to a drift in part, so that what is left may look like little.
+    """
+    fit = fit_receiver(path, gnss, gnss.position_enu, time_offset_s=time_offset_s, with_drift=True)
+    times = gnss.timestamps_ns[fit.rows]
+    seconds = float(times[-1] - times[0]) * 1e-9
+    off, expected = float(np.linalg.norm(fit.drift_mps)) * seconds, 2 * _expected(gnss, fit, level=True)
+    if off < expected or fit.rms > _RAN_AWAY * given.rms:
+        return None
+    words = f"its fixes run away from the cameras' path by {off / seconds:.2f} m/s, {off:.1f} m in all."
+    remedy = "Check its reception and its mode; or leave it out (--set gnss=false)."
+    return SensorCheck(f"gnss {gnss.name}", False, off, expected, words, remedy, "drift of the fixes, m")
 
 
 def _confusion(

@@ -33,7 +33,7 @@ class ReceiverFit:
     scale: metres per visual unit, scale_std relative to it. lag_s: `t_cam + lag_s = t_gnss` of the same place beyond
     the time offset given (a receiver that stamps late has a positive lag), lag_std_s. residuals (N, 3): fix minus path,
     ENU, of the fixes `rows` (N,). rms: robust size of a horizontal residual per axis, metres. path_m: length of the
-    path in metres.
+    path in metres. drift_mps: (2,) east and north, by which the fixes run away from the path; zero if not fitted.
     """
 
     scale: float
@@ -44,6 +44,7 @@ class ReceiverFit:
     rows: NDArray[np.int64]
     rms: float
     path_m: float
+    drift_mps: Array
 
 
 def level_path(trajectory: Trajectory, gravity: Array | None) -> Trajectory:
@@ -63,13 +64,19 @@ def level_path(trajectory: Trajectory, gravity: Array | None) -> Trajectory:
 
 
 def fit_receiver(
-    path: Trajectory, gnss: GnssStream, positions: Array, *, time_offset_s: float, with_lag: bool = True
+    path: Trajectory,
+    gnss: GnssStream,
+    positions: Array,
+    *,
+    time_offset_s: float,
+    with_lag: bool = True,
+    with_drift: bool = False,
 ) -> ReceiverFit:
     """Put a level path onto fixes.
 
     path: one segment of `world_from_cam`, z up, up to scale. positions: (G, 3) of the fixes, as suspected.
-    time_offset_s: of the camera's clock to the IMU's. Raises UnobservableError with fewer than 8 fixes, or where the
-    path is too short against what is left.
+    time_offset_s: of the camera's clock to the IMU's. with_drift: whether the fixes may run away. Raises
+    UnobservableError with fewer than 8 fixes, or where the path is too short against what is left.
     """
     stamps = path.timestamps_ns
     at = gnss.timestamps_ns - round(time_offset_s * 1e9)
@@ -88,17 +95,21 @@ def fit_receiver(
         return interpolate(stamps, path.world_from_body, wanted)
 
     x = _start(poses(0.0).translation, fixes)
-    free = np.ones(9, dtype=bool)
-    size, H, error = 1.0, np.eye(9), np.zeros((len(rows), 3))
+    free = np.ones(11, dtype=bool)
+    free[9:] = with_drift
+    size, H, error = 1.0, np.eye(11), np.zeros((len(rows), 3))
+    seconds = (at[rows] - at[rows].mean()) * 1e-9
     for done in range(25):
         free[8] = with_lag and done >= 4
         here = poses(x[8])
         error = _predicted(x, here) - fixes
-        J = np.empty((len(rows), 3, 9))
+        error[:, :2] += seconds[:, None] * x[9:]
+        J = np.zeros((len(rows), 3, 11))
+        J[:, 0, 9] = J[:, 1, 10] = seconds
         for k, h in enumerate((1e-5, 1e-5, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3)):
-            J[:, :, k] = (_predicted(x + h * np.eye(9)[k], here) - _predicted(x - h * np.eye(9)[k], here)) / (
-                2 * h
-            )
+            J[:, :, k] = (
+                _predicted(x + h * np.eye(11)[k], here) - _predicted(x - h * np.eye(11)[k], here)
+            ) / (2 * h)
         dt = 0.1
         J[:, :, 8] = (_predicted(x, poses(x[8] + dt)) - _predicted(x, poses(x[8] - dt))) / (2 * dt)
         off = np.linalg.norm(error[:, :2], axis=1)
@@ -106,7 +117,7 @@ def fit_receiver(
         weights = 1 / (1 + (off / (3 * size)) ** 2)
         w = np.stack([weights, weights, weights * 0.3], axis=1)
         J = J * free
-        prior = np.zeros(9)
+        prior = np.zeros(11)
         prior[5:8], prior[8] = (size / _LEVER_STD) ** 2, (size / 1.0) ** 2 if free[8] else 1.0
         H = np.einsum("nir,ni,nis->rs", J, w, J) + np.diag(prior)
         gradient = np.einsum("nir,ni,ni->r", J, w, error)
@@ -124,15 +135,15 @@ def fit_receiver(
         raise UnobservableError(f"{gnss.name}: the path is too short against the noise of the fixes.")
     return ReceiverFit(
         scale, float(np.sqrt(covariance[1, 1])), float(x[8]), float(np.sqrt(covariance[8, 8])) if with_lag else 0.0,
-        -error, rows, size, length,
+        -error, rows, size, length, x[9:],
     )  # fmt: skip
 
 
 def _start(path: Array, fixes: Array) -> Array:
-    """`[heading, log scale, offset, lever, lag]` by a similarity in the plane."""
+    """`[heading, log scale, offset, lever, lag, drift]` by a similarity in the plane."""
     a, b = path[:, :2] - path[:, :2].mean(axis=0), fixes[:, :2] - fixes[:, :2].mean(axis=0)
     z = np.sum((a[:, 0] - 1j * a[:, 1]) * (b[:, 0] + 1j * b[:, 1])) / max(float(np.sum(a * a)), 1e-300)
-    x = np.zeros(9)
+    x = np.zeros(11)
     x[0], x[1] = float(np.angle(z)), float(np.log(max(abs(z), 1e-9)))
     spread = float(np.sqrt(np.sum(b * b) / max(float(np.sum(a * a)), 1e-300)))
     if abs(z) < 0.3 * spread:  # hardly alike: at least the size is right
@@ -151,7 +162,7 @@ def _clustered(J: Array, error: Array, w: Array, H: Array, stamps: NDArray[np.in
     """Covariance by the scatter of scores over stretches of five seconds: errors of receivers last."""
     scores = np.einsum("nir,ni,ni->nr", J, w, error)
     _, group = np.unique((stamps - stamps[0]) // 5_000_000_000, return_inverse=True)
-    sums = np.zeros((group.max() + 1, 9))
+    sums = np.zeros((group.max() + 1, scores.shape[1]))
     np.add.at(sums, group, scores)
     inverse = np.linalg.pinv(H, rcond=1e-14, hermitian=True)
     return np.asarray(inverse @ (sums.T @ sums) @ inverse)

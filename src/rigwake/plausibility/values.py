@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -20,7 +20,8 @@ class SensorCheck:
     agrees: whether the figure is within what the sensor's physics allows.
     statistic, expected: the figure, and the most that it may be. quantity: what the figure is, with its unit.
     hypothesis: what is wrong, in one sentence with figures; what was noticed, where it agrees; or empty.
-    remedy: what to do about it. action: what came of it.
+    remedy: what to do about it. action: what came of it. part: what of the sensor is judged, where it
+    is its lens alone.
     """
 
     sensor: str
@@ -31,6 +32,7 @@ class SensorCheck:
     remedy: str = ""
     quantity: str = ""
     action: Action = "none"
+    part: Literal["", "lens"] = ""
 
     def with_action(self, action: Action) -> SensorCheck:
         """The same check, with what came of it."""
@@ -69,30 +71,10 @@ def checks_to_list(checks: Iterable[SensorCheck]) -> list[dict[str, Any]]:
             "hypothesis": check.hypothesis,
             "remedy": check.remedy,
             "action": check.action,
+            "part": check.part,
         }
         for check in checks
     ]
-
-
-def checks_from_list(entries: Iterable[Mapping[str, Any]]) -> tuple[SensorCheck, ...]:
-    """The inverse of `checks_to_list`."""
-
-    def number(value: Any) -> float:
-        return math.nan if value is None else float(value)
-
-    return tuple(
-        SensorCheck(
-            str(entry["sensor"]),
-            bool(entry["agrees"]),
-            number(entry["statistic"]),
-            number(entry["expected"]),
-            str(entry["hypothesis"]),
-            str(entry["remedy"]),
-            str(entry["quantity"]),
-            entry["action"],
-        )
-        for entry in entries
-    )
 
 
 def _finite(value: float) -> float | None:

@@ -145,10 +145,11 @@ def accel_in_si(accel: Array, unit: str, name: str) -> tuple[Array, list[Finding
         return converted, [Finding("warning", name, message)]
     if stated and chosen != stated:
         message = f"the header says {unit}, but accelerations of {size:.3g} are {chosen}: taken so."
-        return converted, [Finding("warning", name, message)]
+        return converted, [Finding("warning", name, message, is_guess=True)]
     said = "the header says so" if stated else f"their size, {size:.3g}, is that of gravity"
     severity = "note" if stated else "warning"
-    return converted, [Finding(severity, name, f"accelerations in {chosen} ({said}): converted to m/s^2.")]
+    message = f"accelerations in {chosen} ({said}): converted to m/s^2."
+    return converted, [Finding(severity, name, message, is_guess=not stated)]
 
 
 def headerless_columns(numbers: Array) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
