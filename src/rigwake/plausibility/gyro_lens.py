@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigwake._robust import robust_std
-from rigwake._types import Array
+from rigwake._types import Array, Stamps
 from rigwake.ba.rig.intrinsics_refinement import IntrinsicsWidth, intrinsics_prior
 from rigwake.cameras.models.lens import axis_focal_px
 from rigwake.cameras.protocol import CameraModel
@@ -44,6 +44,7 @@ _MOUNT_STD = np.array([0.5, 0.5, 0.5, 0.05, 0.05, 0.05, 0.1])
 _MOUNT_STEPS = np.array([1e-5] * 6 + [1e-4])
 _STEP_PX = 0.02
 _WITHOUT_RAY = 0.1  # radians: what a point counts that the lens has no ray for
+_NO_RAY, _MOST_PX = np.array([0.0, 0.0, 1.0]), 3.0
 _LARGEST = 0.5  # of a parameter's prior deviation, in one step
 
 
@@ -68,18 +69,11 @@ class GyroLens:
     pairs: int
 
 
-def fit_lens_to_gyroscope(
-    tracks: Tracks,
-    turns: Trajectory,
-    start: CameraModel,
-    imu: ImuStream,
-    turn: TurnFit,
-    width: IntrinsicsWidth = UNKNOWN,
-) -> GyroLens:
-    """The lens by which the pictures turn as the gyroscope does.
+def pairs_for_lens(tracks: Tracks, turns: Trajectory) -> ViewPairs:
+    """Pairs of frames that tell a lens.
 
-    tracks: pixels count, not bearings. turns: rotations of the camera by `start`, roughly. turn: how these compare with
-    the gyroscope's. Raises EstimationError where fewer than 8 pairs of frames share enough tracks over a turn.
+    tracks: pixels count, not bearings. turns: rotations of the camera, roughly. Raises EstimationError where fewer than
+    8 pairs of frames share enough tracks over a turn.
     """
     pairs = choose_pairs(tracks, turns, within_segments=False)
     if len(pairs.rotation) < _FEWEST_PAIRS:
@@ -88,8 +82,53 @@ def fit_lens_to_gyroscope(
             consequence="Its lens cannot be found from the motion.",
             remedy="Record turns of 60 degrees and more to both sides, with near and far things in view.",
         )
-    problem = _Problem(pairs, start, integrate_gyro(imu), turn, width)
-    return problem.solved(turn)
+    return pairs
+
+
+def fit_lens_to_gyroscope(
+    pairs: ViewPairs, start: CameraModel, imu: ImuStream, turn: TurnFit, width: IntrinsicsWidth = UNKNOWN
+) -> GyroLens:
+    """The lens by which pictures turn as the gyroscope does.
+
+    start: the prior's mean; width: its deviations. turn: how the camera's turns compare with the gyroscope's by a lens
+    like `start`.
+    """
+    return _Problem(pairs, start, integrate_gyro(imu), turn, width).solved(turn)
+
+
+def held_out_errors_px(found: GyroLens, pairs: ViewPairs, imu: ImuStream) -> Array:
+    """(P,) RMS of the epipolar distances of pairs that a lens was not fitted to, each with the direction that suits it.
+
+    A distance counts 3 px at the most, as does a point that the lens has no ray for.
+    """
+    shift = round(found.time_offset_s * 1e9)
+    R = _rotations(
+        pairs,
+        integrate_gyro(imu),
+        found.imu_from_cam,
+        found.gyro_bias,
+        pairs.first_ns + shift,
+        pairs.second_ns + shift,
+    )
+    (a, seen_a), (b, seen_b) = (found.lens.unproject(p) for p in (pairs.first, pairs.second))
+    valid = (seen_a & seen_b)[:, None]
+    a, b = np.where(valid, a, _NO_RAY), np.where(valid, b, _NO_RAY)
+    off = sampson_distances(a, b, R, direction_of_pairs(pairs, a, b, R), pairs.pair) * axis_focal_px(
+        found.lens
+    )
+    squares = np.where(valid[:, 0], np.minimum(off**2, _MOST_PX**2), _MOST_PX**2)
+    starts = np.searchsorted(pairs.pair, np.arange(len(R)))
+    counts = np.bincount(pairs.pair, minlength=len(R))
+    return np.asarray(np.sqrt(np.add.reduceat(squares, starts) / counts))
+
+
+def _rotations(
+    pairs: ViewPairs, turned: TurnedImu, X: Array, bias: Array, first_ns: Stamps, second_ns: Stamps
+) -> Array:
+    """(P, 3, 3) `second_from_first` of a camera with `X = imu_from_cam`, by the gyroscope at its own stamps."""
+    turn = so3.log(np.swapaxes(turned.at(first_ns), 1, 2) @ turned.at(second_ns))
+    seconds = ((second_ns - first_ns) * 1e-9)[:, None]
+    return np.asarray(np.swapaxes(X.T @ so3.exp(turn - bias * seconds) @ X, 1, 2))
 
 
 class _State(NamedTuple):
@@ -128,13 +167,8 @@ class _Problem:
     def rotations(self, x: Array, X: Array) -> Array:
         """(P, 3, 3) `second_from_first` of every pair by the gyroscope."""
         shift = round((self.offset_s + float(x[6])) * 1e9)
-        first, second = (
-            self.turned.at(stamps + shift) for stamps in (self.pairs.first_ns, self.pairs.second_ns)
-        )
-        turn = so3.log(np.swapaxes(first, 1, 2) @ second)
-        seconds = ((self.pairs.second_ns - self.pairs.first_ns) * 1e-9)[:, None]
-        own = so3.exp(turn - (self.bias + x[3:6]) * seconds)
-        return np.asarray(np.swapaxes(X.T @ own @ X, 1, 2))
+        pairs, bias = self.pairs, self.bias + x[3:6]
+        return _rotations(pairs, self.turned, X, bias, pairs.first_ns + shift, pairs.second_ns + shift)
 
     def bearings(self, x: Array) -> tuple[Array, Array, Array]:
         lens = self.lens_at(x)

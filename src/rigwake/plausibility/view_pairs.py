@@ -36,6 +36,14 @@ class ViewPairs:
     first_ns: Stamps
     second_ns: Stamps
 
+    def take(self, index: Indices) -> ViewPairs:
+        """The chosen pairs (increasing indices)."""
+        rows = np.flatnonzero(np.isin(self.pair, index))
+        return ViewPairs(
+            self.first[rows], self.second[rows], np.searchsorted(index, self.pair[rows]), self.rotation[index],
+            self.direction[index], self.first_ns[index], self.second_ns[index],
+        )  # fmt: skip
+
 
 def _no_pairs() -> ViewPairs:
     pixels, stamps = np.empty((0, 2)), np.empty(0, np.int64)
