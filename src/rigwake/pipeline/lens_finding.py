@@ -150,9 +150,16 @@ def _known_fov_deg(stream: CameraStream) -> float:
             consequence="Where to start looking for its lens is not known.",
             remedy=f"Say how wide it sees, to ten per cent: --fov {stream.name}=90.",
         )
-    sides = np.array([[0.0, stream.height_px / 2], [stream.width_px - 1.0, stream.height_px / 2]])
-    bearings, _ = stream.model.unproject(sides)
-    return float(np.rad2deg(np.arctan2(np.hypot(bearings[:, 0], bearings[:, 1]), bearings[:, 2]).sum()))
+    return field_across_deg(stream.model)
+
+
+def field_across_deg(lens: CameraModel) -> float:
+    """Full field of view across the picture's width, degrees; where the lens ends before, as it would go on."""
+    columns = np.arange(float(lens.width_px))
+    bearings, seen = lens.unproject(np.stack([columns, np.full_like(columns, lens.height_px / 2)], axis=1))
+    ends = np.flatnonzero(seen)[[0, -1]]
+    angles = np.arctan2(np.hypot(bearings[ends, 0], bearings[ends, 1]), bearings[ends, 2])
+    return float(np.rad2deg(angles.sum()) * (lens.width_px - 1) / max(int(ends[1] - ends[0]), 1))
 
 
 def _image_circle(dark: Mask) -> tuple[Array, float] | None:

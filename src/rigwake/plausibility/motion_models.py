@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigwake._types import Array
-from rigwake.ba.rig.intrinsics_refinement import IntrinsicsWidth
+from rigwake.ba.rig.intrinsics_refinement import IntrinsicsWidth, moved_px
 from rigwake.cameras.model_fitting import convert_camera
 from rigwake.cameras.registry import camera_from_params
-from rigwake.errors import RigwakeError
+from rigwake.errors import EstimationError, RigwakeError
 from rigwake.plausibility.gyro_lens import GyroLens, fit_lens_to_gyroscope, held_out_errors_px
 from rigwake.plausibility.turn_fit import TurnFit
 from rigwake.plausibility.view_pairs import ViewPairs
@@ -19,6 +19,8 @@ from rigwake.recording import ImuStream
 
 CANDIDATES_BY_MOTION = ("kb4", "mei", "ds", "scaramuzza", "pinhole")
 _FOLDS = 2
+_PINHOLE_REACH = np.deg2rad(75.0)
+_FAR_PX, _SEES = 8.0, 0.97  # from where it started; part of the points that it has a ray for
 _NEAR = IntrinsicsWidth(focal=0.05, centre_px=15.0, distortion=0.1, aspect=0.002)
 
 
@@ -81,6 +83,8 @@ def _score(
     errors = np.empty(count)
     try:
         reach = _reach(near, pairs)
+        if model == "pinhole" and reach > _PINHOLE_REACH:
+            raise EstimationError("It sees too wide for a pinhole.")
         close = convert_camera(near.lens, model, reach).camera
         # where the model ends follows from its parameters: points beyond count against it
         start = camera_from_params(model, close.params, close.width_px, close.height_px)
@@ -89,10 +93,20 @@ def _score(
             fitted = fit_lens_to_gyroscope(pairs.take(np.flatnonzero(~held_out)), start, imu, turn, _NEAR)
             errors[held_out] = held_out_errors_px(fitted, pairs.take(np.flatnonzero(held_out)), imu)
         found = fit_lens_to_gyroscope(pairs, start, imu, turn, _NEAR)
+        _require_near(found, near, pairs)
     except (RigwakeError, np.linalg.LinAlgError) as error:
         return MotionScore(model, np.inf, failure=str(error)), None
     free = len(found.lens.params) - len(getattr(found.lens, "fixed_by_default", ()))
     return MotionScore(model, float(errors.mean()), free, found), errors
+
+
+def _require_near(found: GyroLens, near: GyroLens, pairs: ViewPairs) -> None:
+    """Raise EstimationError for a lens that shows other directions than the one it started from: where a model cannot
+    follow, its rays may shrink to a bundle between which no distances are left."""
+    moved = np.linalg.norm(moved_px(near.lens, found.lens, pairs.first), axis=1)
+    known = np.isfinite(moved)
+    if known.mean() < _SEES or float(np.median(moved[known])) > _FAR_PX:
+        raise EstimationError("It cannot follow this lens.")
 
 
 def _reach(near: GyroLens, pairs: ViewPairs) -> float:
