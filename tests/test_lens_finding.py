@@ -52,7 +52,8 @@ SEEN_BY = {"kb4": (KB4, 186.0), "mei": (MEI, 170.0), "pinhole": (PINHOLE, 110.0)
 def world_seen_by(model: str) -> SimulatedTracks:
     document = load_scenario("demo").model_dump()
     params, fov_deg = SEEN_BY[model]
-    lens = {"model": model, "params": params, "fov_deg": fov_deg}
+    held = {"pinhole": {"skew": 0.0, "k3": 0.0}, "mei": {"k3": 0.0}}.get(model, {})
+    lens = {"model": model, "params": params | held, "fov_deg": fov_deg}
     document["cameras"] = [{**document["cameras"][0], **lens}]
     document["tracking"] |= {"features": 100, "landmarks": 1500, "outliers": 0.01, "water": 0.0}
     return simulate_tracks(build_scenario(document, "test"))

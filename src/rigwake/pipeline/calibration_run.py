@@ -192,7 +192,7 @@ def _estimate(
         masks=out / "masks",
         external=prepared.external is not None,
         without_horizon=frozenset(o.name for o in outcomes if o.without_horizon),
-        doubtful=frozenset(prepared.found),
+        guessed=frozenset(prepared.found),
         progress=lambda words, fraction: progress("rig", words, fraction),
     )
     save_calibration(found.first.handeye, out / "initial_rig.yaml")

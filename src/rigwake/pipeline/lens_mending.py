@@ -127,11 +127,11 @@ def mend_lenses(
     )
 
 
-def with_doubtful(mended: MendedLenses, doubtful: frozenset[str]) -> MendedLenses:
+def with_guessed(mended: MendedLenses, guessed: frozenset[str]) -> MendedLenses:
     """The same, the lenses of these cameras believed no more than such as had to be moved."""
     beliefs = {
         name: LensBelief(lens, DISBELIEVED)
-        for name in doubtful & mended.trajectories.keys()
+        for name in guessed & mended.trajectories.keys()
         if (lens := mended.selection.cameras[name].model) is not None
     }
     if not beliefs:
