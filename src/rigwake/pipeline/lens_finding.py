@@ -38,7 +38,7 @@ _CIRCLE_DEG = 180.0  # across an image circle, if nobody says more
 _PINHOLE_BELOW_DEG = 100.0
 _LEAST_DARK = 0.02  # of the picture, beyond the image circle
 _MOST_FRAMES = 500
-_ROUNDS, _SETTLED_PX = 4, 0.3
+_ROUNDS, _SETTLED_PX = 8, 0.3
 _UNRELATED = 0.5  # of the turns that the gyroscope does not explain
 _POOR_PX = 1.5
 
