@@ -89,9 +89,9 @@ def choose_pairs(tracks: Tracks, trajectory: Trajectory, *, within_segments: boo
             break
     if not chosen:
         return _no_pairs()
-    first, second, turns, ways, ends = zip(*chosen, strict=True)
+    first, second, turns, ways, stamped = zip(*chosen, strict=True)
     pair = np.repeat(np.arange(len(chosen)), [len(f) for f in first])
-    first_ns, second_ns = np.array(ends).T
+    first_ns, second_ns = np.array(stamped, dtype=np.int64).T
     return ViewPairs(
         np.concatenate(first),
         np.concatenate(second),
