@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigwake._robust import robust_std
-from rigwake._types import Array, Stamps
+from rigwake._types import Array, Mask, Stamps
 from rigwake.ba.rig.intrinsics_refinement import IntrinsicsWidth, intrinsics_prior
 from rigwake.cameras.models.lens import axis_focal_px
 from rigwake.cameras.protocol import CameraModel
@@ -170,7 +170,7 @@ class _Problem:
         pairs, bias = self.pairs, self.bias + x[3:6]
         return _rotations(pairs, self.turned, X, bias, pairs.first_ns + shift, pairs.second_ns + shift)
 
-    def bearings(self, x: Array) -> tuple[Array, Array, Array]:
+    def bearings(self, x: Array) -> tuple[Array, Array, Mask]:
         lens = self.lens_at(x)
         (a, seen_a), (b, seen_b) = (lens.unproject(p) for p in (self.pairs.first, self.pairs.second))
         valid = seen_a & seen_b
