@@ -126,7 +126,7 @@ def _minimise(pairs: ViewPairs, model: CameraModel, scale_std: float) -> LensFit
         reduced, right, back = eliminate_pairs(pairs, error, J_pose, J_lens, weights, damping)
         prior = (scale**2) / np.array([scale_std, 0.2 * focal, 0.2 * focal]) ** 2
         if done < 3:  # poses first, with the lens given
-            step_lens = np.zeros(3)
+            step_lens: Array = np.zeros(3)
         else:
             step_lens = np.linalg.solve(reduced + np.diag(prior), right - prior * lens)
             damping = max(damping / 10, 1e-9)
