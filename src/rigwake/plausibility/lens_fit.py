@@ -128,7 +128,9 @@ def _minimise(pairs: ViewPairs, model: CameraModel, scale_std: float) -> LensFit
         if done < 3:  # poses first, with the lens given
             step_lens: Array = np.zeros(3)
         else:
-            step_lens = np.linalg.solve(reduced + np.diag(prior), right - prior * lens)
+            step_lens = np.asarray(
+                np.linalg.solve(reduced + np.diag(prior), right - prior * lens), dtype=np.float64
+            )
             damping = max(damping / 10, 1e-9)
         step_pose = back(step_lens)
         lens = lens + np.clip(
