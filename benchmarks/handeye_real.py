@@ -236,6 +236,51 @@ def main() -> None:
             f"{check.from_published[1]:.2f} mm; clock {check.clock_ms:+.3f} ms | direct from published "
             f"{check.direct_from_published[0]:.3f} deg, {check.direct_from_published[1]:.2f} mm |"
         )
+    print_pairs(recordings / "handeye_real")
+
+
+# reference, member, what is known of the rotation: two odometries said to be in the axes of one body
+PAIRS = {
+    "hilti_Basement_1": ("svo", "hdl", np.diag([1.0, -1.0, -1.0])),
+    "hilti_Basement_4": ("svo", "hdl", np.eye(3)),
+    "hilti_Construction_Site_1": ("svo", "hdl", np.eye(3)),
+    "kitti_gray_colour": ("gray", "colour", np.eye(3)),
+}
+
+
+def pair_errors(folder: Path, name: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Errors (3,) of a pair's rotation in degrees and their deviations, either trajectory being the reference."""
+    reference, member, rotation = PAIRS[name]
+    both = {n: read_trajectory(folder / name / f"{n}.tum", name=n).trajectory for n in (reference, member)}
+    found = []
+    for one, other, true in ((reference, member, rotation), (member, reference, rotation.T)):
+        camera = calibrate_handeye(both[one], [both[other]]).members[other]
+        error = np.rad2deg(so3.log(camera.rig_from_cam.rotation @ true.T))
+        found.append((error, camera.std_rotation_deg))
+    return found
+
+
+def starry_errors(folder: Path) -> tuple[np.ndarray, np.ndarray, str]:
+    """Errors (3,) of the translation in millimetres from the published one, their deviations, the model of noise."""
+    tx, ty, tz = np.loadtxt(folder / "starry" / "truth.txt", usecols=range(3))
+    both = [read_trajectory(folder / "starry" / f"{n}.tum", name=n).trajectory for n in ("vehicle", "cam")]
+    result = calibrate_handeye(both[0], [both[1]])
+    error = result.ref_from_members["cam"].translation - np.array([tx, ty, tz])
+    return 1e3 * error, 1e3 * result.members["cam"].std_translation_m, result.noise
+
+
+def print_pairs(folder: Path) -> None:
+    """Odometries of different sensors on one body: errors in deviations, over all axes both ways."""
+    within = []
+    for name in PAIRS:
+        for way, (error, std) in zip(("", ", the other way"), pair_errors(folder, name), strict=True):
+            within += (np.abs(error) <= 3 * std).tolist()
+            words = ", ".join(f"{e:+.3f} ± {s:.3f}" for e, s in zip(error, std, strict=True))
+            print(f"| {name}{way} | {words} deg | |")
+    print(f"| axes of rotation within 3 sigma | {sum(within)} of {len(within)} | asked 95 % |")
+    error, std, noise = starry_errors(folder)
+    words = ", ".join(f"{e:+.1f} ± {s:.1f}" for e, s in zip(error, std, strict=True))
+    print(f"| starry, {noise} | {words} mm from the published translation | asked 20 mm |")
 
 
 if __name__ == "__main__":

@@ -32,6 +32,8 @@ USED = [
         "seed: 5",
     ),
     ("calibrate --print-config --precision 5mm,0.02deg --budget 120", 0, "budget_s: 120"),
+    ("calibrate --print-config --intrinsics find --fov front=185 --fov 90", 0, "front: 185.0"),
+    ("calibrate --print-config --fov front=wide", 2, "is no number of degrees"),
     ("calibrate --print-config --all", 0, "use_all: true"),
     ("calibrate --print-config --seed 7 --config {settings}", 0, "min_duration_s: 2"),
     (
@@ -127,6 +129,8 @@ USED = [
     ("diff {calibration} {open}", 0, "next:"),
     ("diff {calibration} {open} --html {here}/diff.html", 0, "next:"),
     ("handeye {rig_tum} {port_tum} -o {here}/h12.yaml --html {here}/handeye.html", 0, "mountings determined"),
+    ("intrinsics {images} --from-motion --fov 85", 3, "3.0 s of images"),
+    ("intrinsics {corners} --image-size 640x480 --fov front=90", 2, "one --fov holds for every lens"),
     ("intrinsics {corners} --image-size 640x480 --model kb4 --html {here}/lens.html", 0, "written:"),
     (
         "intrinsics {images} --camera all --board chessboard:9x6:0.03 --topic camera.front=/a --topics {topics}",

@@ -50,3 +50,17 @@ def test_cameras_before_a_board_without_using_that_they_share_it(real_recordings
     assert known_fraction.from_published[0] < 0.05
     assert known_fraction.from_published[1] < 0.5
     assert abs(known_fraction.clock_ms) < 0.1
+
+
+@pytest.mark.slow
+def test_odometries_of_different_sensors_err_by_what_they_say(real_recordings):
+    folder = real_recordings / "handeye_real"
+    within = [
+        np.abs(error) <= 3 * std
+        for name in BENCHMARK["PAIRS"]
+        for error, std in BENCHMARK["pair_errors"](folder, name)
+    ]
+    assert np.mean(within) >= 0.95
+    error_mm, _, noise = BENCHMARK["starry_errors"](folder)
+    assert "poses" in noise  # they do not drift, though their errors last for seconds
+    assert np.abs(error_mm).max() <= 20

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
@@ -42,7 +42,8 @@ class CalibrateConfig(BaseModel):
     time_offsets: estimate the cameras' clocks. imu, gnss: whether to use them.
     sensor_checks: compare every sensor with the others; repair: correct units, leave out samples that cannot be right.
     horizon: leave out what lies below the horizon (needs an IMU): on, off, or auto (where it is water).
-    intrinsics: fixed (as given), or refine (with the rig, about what was given).
+    intrinsics: fixed (as given), refine (with the rig, about what was given), or find (from the motion, whatever was
+    given). fov_deg: full fields of view by camera (`all`: of the others), degrees, for find.
     use_all: use all of the recording; precision: else enough of it for these predicted sigmas of every camera (`5mm`,
     `0.02deg` or both); budget_s: CPU-seconds that it may take.
     line_delay_s: read-out time per row of rolling shutters, by camera; estimate_line_delay: refine it.
@@ -68,6 +69,9 @@ class CalibrateConfig(BaseModel):
     repair: bool = True
     horizon: HorizonChoice = "auto"
     intrinsics: IntrinsicsChoice = "refine"
+    fov_deg: dict[str, Annotated[float, Field(gt=0, lt=360, allow_inf_nan=False)]] = Field(
+        default_factory=dict
+    )
     line_delay_s: dict[str, float] = Field(default_factory=dict)
     estimate_line_delay: bool = False
     imu_noise: ImuNoiseSettings = ImuNoiseSettings()

@@ -20,10 +20,12 @@ from rigwake.cli.console import (
 from rigwake.cli.options import (
     AllowPartialOption,
     CameraFileOption,
+    FovOption,
     HorizonOption,
     JsonOption,
     TopicOption,
     TopicsOption,
+    fields_of_view,
     horizon_choice,
     require_scheduler,
     require_there,
@@ -78,8 +80,11 @@ def command(
     horizon: HorizonOption = "auto",
     intrinsics: Annotated[
         str | None,
-        typer.Option(help="refine them with the rig (default), or keep them fixed as given."),
+        typer.Option(
+            help="refine them with the rig (default), keep them fixed as given, or find them from the motion."
+        ),
     ] = None,
+    fov: FovOption = None,
     jobs: Annotated[int | None, typer.Option(help="Processes (default: one per core).")] = None,
     seed: Annotated[int | None, typer.Option(help="Random seed.")] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file of settings.")] = None,
@@ -133,6 +138,7 @@ def command(
         budget_s=budget,
         use_all=use_all or None,
         intrinsics=intrinsics,
+        fov_deg=fields_of_view(fov) or None,
         horizon=None if horizon == "auto" else horizon_choice(horizon),
         jobs=jobs,
         seed=seed,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 from rich.markup import escape
@@ -22,12 +22,13 @@ from rigwake.cli.console import (
 )
 from rigwake.cli.options import (
     LENS_MODELS,
+    FovOption,
     JsonOption,
     TopicOption,
     TopicsOption,
     completed_from,
+    fields_of_view,
     require,
-    require_number,
     require_there,
     require_writable,
     topic_words,
@@ -75,9 +76,13 @@ def command(
     ] = None,
     name: Annotated[str | None, typer.Option(help="The camera's name in the file.")] = None,
     image_size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT, needed with a csv file.")] = None,
-    fov: Annotated[
-        float | None, typer.Option(help="The lens's full field of view in degrees, if known.")
-    ] = None,
+    from_motion: Annotated[
+        bool,
+        typer.Option(
+            "--from-motion", help="Of a recording without a board: by how its pictures and IMU turn."
+        ),
+    ] = False,
+    fov: FovOption = None,
     fix: Annotated[str, typer.Option(help="Parameters to hold, comma-separated: `skew,k3`.")] = "",
     free: Annotated[str, typer.Option(help="Parameters to estimate though they are held by default.")] = "",
     html: Annotated[
@@ -92,25 +97,33 @@ def command(
     Example: [cyan]rigwake intrinsics images/ --board aprilgrid:6x6:0.088:0.3 --model kb4 -o front.yaml[/cyan]
 
     Example: [cyan]rigwake intrinsics board.bag --camera all --board chessboard:9x6:0.03 -o lenses.yaml[/cyan]
+
+    Example: [cyan]rigwake intrinsics sail.bag --from-motion --fov 185 -o lenses.yaml[/cyan]
     """
     require_there(*images, topics)
     require("--model", model, (*LENS_MODELS, "auto"))
-    require_number("--fov", fov, above=0.0, below=360.0)
+    fov_deg = fields_of_view(fov)
     require_writable("-o", output)
     require_writable("--html", html)
     require_writable("--plots", plots, folder=True)
     require_writable("--json", json_file)
-    if camera is not None and len(images) > 1:
+    if (camera is not None or from_motion) and len(images) > 1:
+        option = "--from-motion" if from_motion else "--camera"
         raise UsageError(
-            "--camera reads one recording.", remedy="Give the recording alone, or leave out --camera."
+            f"{option} reads one recording.", remedy=f"Give the recording alone, or leave out {option}."
         )
+    if from_motion:
+        _by_motion(images[0], camera, fov_deg, _TopicWords(topic, topics), output, json_file)
+        return
+    if fov_deg.keys() - {"all"}:
+        raise UsageError("With a board, one --fov holds for every lens.", remedy="Give --fov 185.")
     if plots is not None:
         require_extra("matplotlib", "report", "Writing plots")
     from rigwake.atomic import write_text_atomic
     from rigwake.intrinsics.result_file import save_intrinsics
     from rigwake.pipeline.intrinsics_run import LensChoice
 
-    choice = LensChoice(model, _names(fix), _names(free), fov)
+    choice = LensChoice(model, _names(fix), _names(free), fov_deg.get("all"))
     if camera is not None:
         run = _of_recording(images[0], camera, _TopicWords(topic, topics), _board_named(board), choice)
     else:
@@ -190,6 +203,62 @@ def _of_recording(
         return lenses_of_recording(cameras_named(opened, camera), board, choice, bars)
 
 
+def _by_motion(
+    recording: Path,
+    camera: str | None,
+    fov_deg: dict[str, float],
+    given: _TopicWords,
+    output: Path | None,
+    json_file: Path | None,
+) -> None:
+    """Lenses of a recording that shows no board, from the motion of the whole rig."""
+    from rigwake.config import load_config
+    from rigwake.intrinsics.result_file import save_intrinsics
+    from rigwake.pipeline.intrinsics_run import lenses_from_motion
+    from rigwake.readers.topics import TopicMap
+
+    chosen = None if camera in (None, "all") else [camera]
+    config = load_config(None, intrinsics="find", fov_deg=fov_deg or None, cameras=chosen)
+    topics = TopicMap.from_options(given.topic or (), given.topics)
+    with progress_bars() as bars:
+        lenses = lenses_from_motion(recording, config, topics, bars)
+    if output is not None and lenses.contents:
+        save_intrinsics(output, lenses.contents)
+    if json_file is not None:
+        write_json(json_file, dict(lenses.contents))
+    if str(json_file) != "-":
+        for name, content in lenses.contents.items():
+            _print_by_motion(name, content)
+        for note in lenses.notes:
+            out.print(f"[dim]note: {escape(note)}[/dim]", soft_wrap=True)
+        if output is not None:
+            out.print(f"written: {escape(str(output))}", soft_wrap=True)
+            next_step(
+                ["rigwake", "calibrate", recording, "--camera-file", output, "--help"],
+                "another recording of the same cameras can be calibrated with them",
+            )
+    if lenses.failed:
+        reasons = "; ".join(f"{name}: {why}" for name, why in lenses.failed.items())
+        raise PartialResultError(f"Cameras have no lens: {', '.join(lenses.failed)}.", consequence=reasons)
+
+
+def _print_by_motion(name: str, content: Mapping[str, Any]) -> None:
+    table = figures_table(("parameter", "value", "± 1 sigma"))
+    known = content.get("calibration", {"std": {}, "fixed": []})
+    for parameter, value in content["params"].items():
+        std = known["std"].get(parameter)
+        words = (
+            "held"
+            if parameter in known["fixed"]
+            else "not told by the motion"
+            if std is None
+            else f"{std:.3g}"
+        )
+        table.add_row(parameter, f"{value:.8g}", words)
+    print_title(f"{name}: {content['model']}, {content['width_px']} x {content['height_px']} px")
+    out.print(table)
+
+
 def _refuse_missing(failed: Mapping[str, RigwakeError], found: int) -> None:
     """Raises the reason where there is no lens at all, PartialResultError where some cameras have none."""
     if not failed:
@@ -206,10 +275,16 @@ def _refuse_missing(failed: Mapping[str, RigwakeError], found: int) -> None:
 
 
 def _words_again(
-    images: list[Path], board: str | None, image_size: str | None, fov: float | None, fix: str, free: str
+    images: list[Path], board: str | None, image_size: str | None, fov: list[str] | None, fix: str, free: str
 ) -> list[object]:
     """The same command again, but for its model and its outputs."""
-    options = {"--board": board, "--image-size": image_size, "--fov": fov, "--fix": fix, "--free": free}
+    options = {
+        "--board": board,
+        "--image-size": image_size,
+        "--fov": fov[-1] if fov else None,
+        "--fix": fix,
+        "--free": free,
+    }
     given = [word for option, value in options.items() if value for word in (option, value)]
     return ["rigwake", "intrinsics", *images, *given]
 

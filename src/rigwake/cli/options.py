@@ -61,6 +61,14 @@ CameraFileOption = Annotated[
         help="Lenses from a file of any known format, instead of the recording's. May be repeated.",
     ),
 ]
+FovOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--fov",
+        metavar="[CAMERA=]DEGREES",
+        help="Full field of view, if known, of one camera or of all: front=185. May be repeated.",
+    ),
+]
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Write the result as JSON ('-': print).")]
 AllowPartialOption = Annotated[
     bool,
@@ -98,6 +106,24 @@ def horizon_choice(value: str) -> HorizonChoice:
 
     require("--horizon", value, get_args(HorizonChoice))
     return cast("HorizonChoice", value)
+
+
+def fields_of_view(assignments: Sequence[str] | None) -> dict[str, float]:
+    """Degrees by camera of `--fov front=185`, `all` those of `--fov 185`; UsageError for what is no possible angle."""
+    found = {}
+    for assignment in assignments or ():
+        name, equals, words = assignment.rpartition("=")
+        try:
+            degrees = float(words)
+        except ValueError:
+            raise UsageError(
+                f"--fov {assignment[:60]!r} is no number of degrees.", remedy="Example: --fov front=185"
+            ) from None
+        require_number("--fov", degrees, above=0.0, below=360.0)
+        if equals and not name.strip():
+            raise UsageError(f"--fov {assignment[:60]!r} names no camera.", remedy="Example: --fov front=185")
+        found[name.strip() or "all"] = degrees
+    return found
 
 
 def require(option: str, value: str, known: Sequence[str]) -> None:

@@ -8,9 +8,10 @@ long strides: a rotation that jitters moves the end of a stride by the way saile
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rigwake._types import Array
 from rigwake.calibration.rig_calibration import CalibratedCamera, UnobservableDirection
@@ -41,7 +42,12 @@ _LONGEST_WITHOUT_DRIFT = 20_000  # steps
 _MOST_PIECES = 60  # segments of all members: each has a world of its own in the model of the poses
 _STRIDES = 8  # that make up the recording, where its variance over a long stride is taken
 _SATURATED = 0.5  # of the variance that independent errors of the increments would have reached
-_STATIONARY = 1.000  # 5 % limit of the statistic for three series (Nyblom and Harvey 2000, table 1)
+# 5 and 1 % limits of the statistic for three series (Nyblom and Harvey 2000, table 1): errors that last for seconds
+# come near the former without wandering, so the latter holds where variance does not grow with the stride either
+_STATIONARY, _SURELY_STATIONARY = 1.000, 1.359
+_GROWS = (
+    1.25  # variance of rotations from half a long stride to a whole: 2 for drift, 1 for errors of each pose
+)
 
 
 def without_drift(
@@ -55,39 +61,46 @@ def without_drift(
     pieces = sum(curve.segment_count for curve in problem.members)
     if len(estimate.valid) > _LONGEST_WITHOUT_DRIFT or pieces > _MOST_PIECES:
         return problem, estimate
-    if not _saturates(problem, estimate):
+    stride = max(2, len(estimate.valid) // _STRIDES)
+    half, whole = (_rotation_variance(problem, estimate, s) for s in (stride // 2, stride))
+    per_step = [
+        float(np.mean(r[v] ** 2, axis=0)[:3].sum()) if v.any() else 0.0 for r, v in _members(estimate)
+    ]
+    if not all(w <= _SATURATED * stride * one for w, one in zip(whole, per_step, strict=True)):
         return problem, estimate
+    grows = any(w > _GROWS * h for h, w in zip(half, whole, strict=True))
+    limit = _STATIONARY if grows else _SURELY_STATIONARY
     as_poses, to_beat = with_poses(problem, options), information_criterion(problem, estimate)
 
     def explains(other: HandeyeEstimate) -> bool:
-        return information_criterion(as_poses, other) < to_beat or _stays(other)
+        return information_criterion(as_poses, other) < to_beat or _stays(other, limit)
 
     other = maximise(as_poses, with_worlds(as_poses, estimate.mountings), options, worthwhile=explains)
     return (as_poses, other) if other.converged and explains(other) else (problem, estimate)
 
 
-def _saturates(problem: HandeyeProblem, estimate: HandeyeEstimate) -> bool:
-    """Whether rotations err less over a long stride than the errors of its steps would add up to."""
-    stride = max(2, len(estimate.valid) // _STRIDES)
+def _members(estimate: HandeyeEstimate) -> Iterator[tuple[Array, NDArray[np.bool_]]]:
+    """Residuals (N, 6) of every member, and which of them are known."""
+    return zip(estimate.residuals, estimate.valid.T, strict=True)
+
+
+def _rotation_variance(problem: HandeyeProblem, estimate: HandeyeEstimate, stride: int) -> list[float]:
+    """By member, mean square by which rotations err over a stride; infinite where no stride is known."""
     reference, sampled = problem.sampled(estimate.mountings)
-    for m, (member, mounting) in enumerate(zip(sampled, estimate.mountings, strict=True)):
+    found = []
+    for member, mounting in zip(sampled, estimate.mountings, strict=True):
         long = steps_between(reference, member, absolute=False, stride=stride)
-        valid = estimate.valid[:, m]
-        if not (long.valid.any() and valid.any()):
-            return False
-        over_stride = np.mean(residuals(long, mounting)[long.valid] ** 2, axis=0)[:3].sum()
-        over_step = np.mean(estimate.residuals[m][valid] ** 2, axis=0)[:3].sum()
-        if over_stride > _SATURATED * stride * over_step:
-            return False
-    return True
+        r = residuals(long, mounting)[long.valid]
+        found.append(float(np.mean(r**2, axis=0)[:3].sum()) if len(r) else float("inf"))
+    return found
 
 
-def _stays(estimate: HandeyeEstimate) -> bool:
+def _stays(estimate: HandeyeEstimate, limit: float) -> bool:
     """No segment's residuals, of rotation or translation, wander."""
     for r, valid, segments in zip(estimate.residuals, estimate.valid.T, estimate.segments.T, strict=True):
         for segment in np.unique(segments[valid]):
             rows = r[valid & (segments == segment)]
-            if any(wandering(rows[:, part]) > _STATIONARY for part in (slice(0, 3), slice(3, 6))):
+            if any(wandering(rows[:, part]) > limit for part in (slice(0, 3), slice(3, 6))):
                 return False
     return True
 

@@ -28,7 +28,7 @@ from rigwake.handeye.likelihood import (
 )
 
 _OPEN_UNITS = 10.0  # how far an open direction may be off: 50 degrees, 10 m
-_BLOCKS = 30  # of time, whose scores are taken to be independent
+_BLOCKS = (30, 10, 6)  # of time, whose scores are taken to be independent: errors may last for a sixth of it
 _LAGS = 10  # poses back, to tell how errors of poses fade
 _LONGEST = 0.98  # part of them that is left from pose to pose
 _NEGLIGIBLE = 0.02  # component of a direction that is not worth naming
@@ -40,15 +40,17 @@ def covariance(problem: HandeyeProblem, estimate: HandeyeEstimate) -> Array:
     Sandwich `H^-1 M H^-1` with H the genuine information. M is the raw information if the noise is known; it
     exceeds H by what the errors of the Jacobians add. If the noise was learnt, M is not less than the
     scatter of the scores over blocks of time, which holds correlation that no model foresaw; errors of poses
-    that last for a while (increments are filtered white, poses are not) count as fewer than there are poses.
+    that last for a while (increments are filtered white, poses are not) count as fewer than there are poses. Blocks
+    are of several lengths, and along every direction the largest scatter holds: errors of odometry last for minutes.
     """
     equations = estimate.equations
     units = useful_units(problem.layouts)
     split = split_observable(equations, estimate.required_ratio)
     middle = np.eye(len(split.genuine))
     if not problem.has_known_noise:
-        values, vectors = np.linalg.eigh(split.basis.T @ _scatter(equations) @ split.basis)
-        middle = (vectors * np.maximum(values, _memory(estimate) if problem.absolute else 1.0)) @ vectors.T
+        middle = middle * (_memory(estimate) if problem.absolute else 1.0)
+        for count in _BLOCKS:
+            middle = _larger(middle, split.basis.T @ _scatter(equations, count) @ split.basis)
     outer = split.basis / split.genuine
     far = _OPEN_UNITS * split.open(units)
     whole = outer @ middle @ outer.T + far @ far.T
@@ -57,9 +59,18 @@ def covariance(problem: HandeyeProblem, estimate: HandeyeEstimate) -> Array:
     return np.asarray(whole + np.diag(4e-15 * scaled * units**2))
 
 
-def _scatter(equations: Equations) -> Array:
+def _larger(first: Array, second: Array) -> Array:
+    """A covariance that is nowhere less than either of two, the first positive definite: along each direction in which
+    they differ alone, the larger one."""
+    L = np.linalg.cholesky(first)
+    values, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, second).T))
+    root = L @ vectors
+    return np.asarray((root * np.maximum(values, 1.0)) @ root.T)
+
+
+def _scatter(equations: Equations, blocks_wanted: int) -> Array:
     scores = equations.scores[equations.used]
-    count = min(_BLOCKS, len(scores))
+    count = min(blocks_wanted, len(scores))
     size, longer = divmod(len(scores), count)
     blocks = np.add.reduceat(scores, np.arange(count) * size + np.minimum(np.arange(count), longer))
     return np.asarray(blocks.T @ blocks * (len(blocks) / max(len(blocks) - 1, 1)))

@@ -36,6 +36,17 @@ def check_line_delays(config: CalibrateConfig, selection: Selection) -> None:
     _check_names("line_delay_s names", config.line_delay_s, selection)
 
 
+def check_fields_of_view(config: CalibrateConfig, selection: Selection) -> None:
+    """Raises UsageError for fields of view of cameras that are not there, or that nothing is done with."""
+    _check_names("fov_deg names", set(config.fov_deg) - {"all"}, selection)
+    if config.fov_deg and config.intrinsics != "find":
+        raise UsageError(
+            f"Fields of view are given, and lenses are to be {config.intrinsics}.",
+            consequence="They would not be used.",
+            remedy="Add --intrinsics find, or leave out --fov.",
+        )
+
+
 def check_prior(prior: RigPrior, selection: Selection) -> None:
     """Raises UsageError for priors and baselines of cameras that take no part, or of impossible values."""
     _check_names("The prior names", prior.cameras, selection)

@@ -17,6 +17,7 @@ from rigwake.config import CalibrateConfig
 from rigwake.errors import InputError, UnobservableError
 from rigwake.fingerprint import files_changed_at, input_fingerprint, unchanged
 from rigwake.pipeline.before_start import (
+    check_fields_of_view,
     check_line_delays,
     check_prior,
     check_reference,
@@ -33,6 +34,7 @@ from rigwake.pipeline.camera_stage import (
     stage_files,
     tracks_file,
 )
+from rigwake.pipeline.lens_finding import FoundLens, find_lenses
 from rigwake.pipeline.out_folder import check_camera_names, check_out_folder, clear_results, used_by_one
 from rigwake.pipeline.outputs import write_outputs
 from rigwake.pipeline.prior import RigPrior
@@ -79,7 +81,7 @@ def _silent(name: str, what: str, fraction: float) -> None:
 @dataclass(frozen=True, eq=False)
 class _Prepared:
     """What a calibration starts with, everything checked. external: trajectories of another odometry, if given.
-    sections: what was chosen of a long recording, and why; empty where all is used."""
+    sections: what was chosen of a long recording, and why; empty where all is used. found: lenses from the motion."""
 
     path: Path
     opened: Recording
@@ -88,6 +90,7 @@ class _Prepared:
     prior: RigPrior
     config: CalibrateConfig
     sections: Mapping[str, Any] = field(default_factory=dict)
+    found: Mapping[str, FoundLens] = field(default_factory=dict)
 
 
 def calibrate(
@@ -123,7 +126,7 @@ def calibrate(
             identity = input_fingerprint(path)
             provenance = _provenance(identity, prepared, topics, external)
             ledger = StageLedger(out, resume=resume)
-            prepared = _with_sections(prepared, progress)
+            prepared = _with_sections(_with_found_lenses(prepared, progress), progress)
             selection, outcomes, checks = _each_camera(prepared, out, ledger, identity, progress, run_cameras)
             check_unchanged()
             estimated = _estimate(prepared, out, selection, outcomes, progress)
@@ -141,8 +144,25 @@ def _prepare(
     check_reference(opened, selection, config.reference)
     check_prior(prior, selection)
     check_line_delays(config, selection)
+    check_fields_of_view(config, selection)
     given = None if external is None else read_external_trajectories(external, selection)
     return _Prepared(path, opened, selection, given, prior, config)
+
+
+def _with_found_lenses(prepared: _Prepared, progress: Progress) -> _Prepared:
+    """With `--intrinsics find`: lenses from the motion. Where none was given, it is that of the field of view."""
+    if prepared.config.intrinsics != "find":
+        return prepared
+    lenses = find_lenses(prepared.selection, prepared.config, progress)
+    cameras = {
+        name: stream
+        if stream.model is not None or name not in lenses.found
+        # it is with this that the report compares
+        else replace(stream, model=lenses.found[name].start)
+        for name, stream in prepared.opened.cameras.items()
+    }
+    opened = replace(prepared.opened, cameras=cameras)
+    return replace(prepared, opened=opened, selection=lenses.selection, found=lenses.found)
 
 
 def _with_sections(prepared: _Prepared, progress: Progress) -> _Prepared:
@@ -172,6 +192,7 @@ def _estimate(
         masks=out / "masks",
         external=prepared.external is not None,
         without_horizon=frozenset(o.name for o in outcomes if o.without_horizon),
+        guessed=frozenset(prepared.found),
         progress=lambda words, fraction: progress("rig", words, fraction),
     )
     save_calibration(found.first.handeye, out / "initial_rig.yaml")

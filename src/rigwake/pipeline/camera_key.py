@@ -18,7 +18,7 @@ from rigwake.recording import CameraStream, ImuStream
 
 # of the settings, those of later stages; everything else may change what is tracked
 _LATER = {"reference", "cameras", "jobs", "time_offsets", "gnss", "line_delay_s", "estimate_line_delay"}
-_LATER |= {"adjustment", "association", "intrinsics", "min_duration_s"}
+_LATER |= {"adjustment", "association", "intrinsics", "fov_deg", "min_duration_s"}
 # the sections that were chosen count by their stamps
 _LATER |= {"use_all", "precision", "budget_s"}
 

@@ -1,10 +1,11 @@
-"""Lenses from a board: one from images, or those of all cameras of a recording."""
+"""Lenses alone: from images of a board, of the cameras of a recording that saw one, or from a recording's motion."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -12,6 +13,8 @@ import numpy as np
 
 from rigwake._progress import Progress
 from rigwake._types import Image
+from rigwake.cameras.registry import camera_to_dict
+from rigwake.config import CalibrateConfig
 from rigwake.errors import HostError, RigwakeError
 from rigwake.intrinsics.board_calibration import IntrinsicCalibration, calibrate
 from rigwake.intrinsics.board_observations import BoardObservations
@@ -19,6 +22,8 @@ from rigwake.intrinsics.board_search import find_board, frame_of
 from rigwake.intrinsics.boards import Board
 from rigwake.intrinsics.result_file import calibration_to_dict
 from rigwake.intrinsics.select import ModelScore, choose, cross_validate
+from rigwake.pipeline.calibration_run import calibrate as calibrate_rig
+from rigwake.readers.topics import TopicMap
 from rigwake.recording import CameraStream
 from rigwake.report.intrinsics_page import CalibratedLens, intrinsics_page
 
@@ -119,6 +124,52 @@ def _lens_of_stream(stream: CameraStream, board: Board, choice: LensChoice, prog
     observations = find_board(board, stream, progress=searched)
     progress(stream.name, "estimating the lens", 0.0)
     return lens_of(observations, choice, load)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionLenses:
+    """Lenses from the motion. contents: by camera, what the camera file holds. failed: cameras without one, and why.
+    notes: what `calibrate` noted on the way."""
+
+    contents: Mapping[str, dict[str, Any]]
+    failed: Mapping[str, str]
+    notes: tuple[str, ...]
+
+
+def lenses_from_motion(
+    recording: Path,
+    config: CalibrateConfig,
+    topics: TopicMap | None = None,
+    progress: Progress = lambda name, what, fraction: None,
+) -> MotionLenses:
+    """The lenses that a calibration of the whole rig finds; the rig itself is not kept.
+
+    config: `intrinsics` is what it says, find or refine. Raises as `pipeline.calibration_run.calibrate`.
+    """
+    with TemporaryDirectory(prefix="rigwake-lenses-") as folder:
+        run = calibrate_rig(recording, Path(folder) / "out", config, topics=topics, progress=progress)
+    contents = {
+        name: {**camera_to_dict(camera.model), **_known_by_motion(camera.statistics.get("intrinsics"))}
+        for name, camera in run.calibration.cameras.items()
+        if camera.model is not None
+    }
+    return MotionLenses(contents, run.failed, run.notes)
+
+
+def _known_by_motion(told: Mapping[str, Any] | None) -> dict[str, Any]:
+    """`calibration` of a camera file: deviations and covariance, null where the motion does not tell a parameter."""
+    if not told:
+        return {}
+    std = {n: None if n in told["not_determined"] else s for n, s in told["std"].items()}
+    return {
+        "calibration": {
+            "from": "motion",
+            "std": std,
+            "fixed": list(told["held"]),
+            "undetermined": list(told["not_determined"]),
+            "covariance": told["covariance"],
+        }
+    }
 
 
 def image_loader(files: Sequence[Path]) -> Callable[[str], Image | None]:

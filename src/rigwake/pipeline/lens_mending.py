@@ -127,6 +127,21 @@ def mend_lenses(
     )
 
 
+def with_guessed(mended: MendedLenses, guessed: frozenset[str]) -> MendedLenses:
+    """The same, the lenses of these cameras believed no more than such as had to be moved."""
+    beliefs = {
+        name: LensBelief(lens, DISBELIEVED)
+        for name in guessed & mended.trajectories.keys()
+        if (lens := mended.selection.cameras[name].model) is not None
+    }
+    if not beliefs:
+        return mended
+    fits = None if mended.fits is None else {n: f for n, f in mended.fits.items() if n not in beliefs}
+    return replace(
+        mended, fits=fits, beliefs={**beliefs, **mended.beliefs}, moved=mended.moved | beliefs.keys()
+    )
+
+
 def started_from(
     mended: MendedLenses, lenses: Mapping[str, CameraModel], odometry: OdometryOptions | None
 ) -> MendedLenses:

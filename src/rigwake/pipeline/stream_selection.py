@@ -90,7 +90,7 @@ def select(recording: Recording, config: CalibrateConfig) -> Selection:
     windowed = {name: _window(camera, begin, end) for name, camera in cameras.items()}
     left_out: dict[str, str] = {}
     for name, camera in list(windowed.items()):
-        if camera.model is None:
+        if camera.model is None and config.intrinsics != "find":
             left_out[name] = "it has no intrinsics (`rigwake intrinsics` finds them)"
             notes.append(f"{name}: left out, {left_out[name]}")
             del windowed[name]
@@ -98,7 +98,7 @@ def select(recording: Recording, config: CalibrateConfig) -> Selection:
         raise InputError(
             "No camera has intrinsics.",
             consequence="Pixels cannot be turned into directions.",
-            remedy="Record camera_info, put them into rig.yaml, or find them with `rigwake intrinsics`.",
+            remedy="Record camera_info, put them into rig.yaml, or find them: `rigwake intrinsics`, --intrinsics find.",
         )
     known = None if imu is None else _with_noise(imu, config, notes)
     return Selection(windowed, known, gnss, tuple(notes), left_out)

@@ -9,7 +9,13 @@ from pathlib import Path
 from rigwake.ba.rig.rig_values import InitialRig
 from rigwake.config import CalibrateConfig
 from rigwake.pipeline.before_start import without_cameras
-from rigwake.pipeline.lens_mending import MendedLenses, mend_lenses, refuse_contradicted, started_from
+from rigwake.pipeline.lens_mending import (
+    MendedLenses,
+    mend_lenses,
+    refuse_contradicted,
+    started_from,
+    with_guessed,
+)
 from rigwake.pipeline.prior import RigPrior
 from rigwake.pipeline.rig_stage import RigEstimate, estimate_rig, initialise_rig
 from rigwake.pipeline.sensor_checks import VettedSensors, vet_sensors
@@ -43,6 +49,7 @@ def estimate_vetted_rig(
     masks: Path,
     external: bool = False,
     without_horizon: frozenset[str] = frozenset(),
+    guessed: frozenset[str] = frozenset(),
     progress: Callable[[str, float], None] = lambda words, fraction: None,
 ) -> VettedRig:
     """Sensors compared, initial values, rig. With intrinsics to refine, lenses that contradict what the cameras saw are
@@ -50,7 +57,7 @@ def estimate_vetted_rig(
     one is done again.
 
     tracks, trajectories: by camera. external: whether another odometry made the trajectories, which then stay.
-    without_horizon: see `vet_sensors`. masks: see `estimate_rig`.
+    without_horizon: see `vet_sensors`. guessed: cameras whose lens is a guess. masks: see `estimate_rig`.
 
     Raises InputError that names a sensor that cannot be right, and as `initialise_rig` and `estimate_rig`.
     """
@@ -60,6 +67,7 @@ def estimate_vetted_rig(
     if config.sensor_checks:
         progress(_WORDS, 0.0)
         mended = mend_lenses(selection, tracks, trajectories, odometry) if refines else mended
+    mended = with_guessed(mended, guessed)
     # landmarks are not looked for in other cameras before the lenses are known
     alone = _without_association(config) if mended.moved else config
     found = _one_pass(recording, mended, alone, prior, masks, without_horizon, mended.moved, progress)

@@ -13,18 +13,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigwake._robust import robust_std
-from rigwake._types import Array, Indices
+from rigwake._types import Array
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import EstimationError
 from rigwake.geometry import so3
-from rigwake.geometry.interpolate import interpolate
+from rigwake.plausibility.view_pairs import (
+    ViewPairs,
+    choose_pairs,
+    eliminate_pairs,
+    moved_pairs,
+    sampson_distances,
+    scatter_covariance,
+    tangents,
+)
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
-_PAIRS = 60
 _FEWEST_PAIRS = 8
-_LEAST_TURN, _MOST_TURN = np.deg2rad(8.0), np.deg2rad(35.0)
-_LEAST_POINTS, _MOST_POINTS = 25, 150
 _ROUNDS = 12
 _STEP_PX = 0.05
 _REPEATS = 4
@@ -48,17 +53,6 @@ class LensFit:
     pairs: int
 
 
-@dataclass(frozen=True, eq=False)
-class _Pairs:
-    """Pixels (K, 2) of both views, the pair of each, and first rotations (P, 3, 3) and directions (P, 3)."""
-
-    first: Array
-    second: Array
-    pair: Indices
-    rotation: Array
-    direction: Array
-
-
 def fit_lens(
     tracks: Tracks,
     model: CameraModel,
@@ -75,7 +69,7 @@ def fit_lens(
     scale_std: how well the focal scale is known to be one already.
     Raises EstimationError where fewer than 8 pairs of frames share enough tracks over a turn of 8 degrees.
     """
-    pairs = _choose_pairs(tracks, trajectory)
+    pairs = choose_pairs(tracks, trajectory)
     if len(pairs.rotation) < _FEWEST_PAIRS:
         raise EstimationError(
             f"{tracks.camera}: only {len(pairs.rotation)} pairs of images show the same points after a turn.",
@@ -85,7 +79,7 @@ def fit_lens(
     return _without_bias(fit, pairs, model, scale_std) if unbiased else fit
 
 
-def _without_bias(fit: LensFit, pairs: _Pairs, model: CameraModel, scale_std: float) -> LensFit:
+def _without_bias(fit: LensFit, pairs: ViewPairs, model: CameraModel, scale_std: float) -> LensFit:
     rng = np.random.default_rng(0)
     noisy = []
     for _ in range(_REPEATS):
@@ -98,58 +92,13 @@ def _without_bias(fit: LensFit, pairs: _Pairs, model: CameraModel, scale_std: fl
     return replace(fit, scale=2 * fit.scale - scale, shift_px=2 * fit.shift_px - shift, covariance=covariance)
 
 
-def _choose_pairs(tracks: Tracks, trajectory: Trajectory) -> _Pairs:
-    """Pairs of frames spread over time, as far apart as their turn and their common tracks allow."""
-    order = np.lexsort((tracks.track_ids, tracks.frame_indices))
-    frame, track, pixels = tracks.frame_indices[order], tracks.track_ids[order], tracks.pixels[order]
-    starts = np.searchsorted(frame, np.arange(len(tracks.timestamps_ns) + 1))
-    stamps, ids = tracks.timestamps_ns, trajectory.segment_ids
-    assert ids is not None
-    frames = np.flatnonzero(
-        (stamps >= trajectory.timestamps_ns[0]) & (stamps <= trajectory.timestamps_ns[-1])
-    )
-    if len(frames) < 3:
-        return _Pairs(
-            np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty((0, 3))
-        )
-    poses = interpolate(trajectory.timestamps_ns, trajectory.world_from_body, stamps[frames])
-    segment = ids[np.clip(np.searchsorted(trajectory.timestamps_ns, stamps[frames]), 0, len(ids) - 1)]
-    rate = 1e9 / float(np.median(np.diff(stamps)))
-    reach = np.unique(np.round(rate * np.array([2.5, 1.8, 1.2, 0.8, 0.5])).astype(int))[::-1]
-    chosen: list[tuple[Array, Array, Array, Array]] = []
-    for a in np.unique(np.linspace(0, len(frames) - 2, _PAIRS).astype(int)):
-        for step in reach[reach > 0]:
-            b = a + step
-            if b >= len(frames) or segment[a] != segment[b]:
-                continue
-            turn = poses.rotation[b].T @ poses.rotation[a]
-            if not _LEAST_TURN <= np.linalg.norm(so3.log(turn)) <= _MOST_TURN:
-                continue
-            one, two = (slice(starts[f], starts[f + 1]) for f in (frames[a], frames[b]))
-            _, i, j = np.intersect1d(track[one], track[two], assume_unique=True, return_indices=True)
-            if len(i) < _LEAST_POINTS:
-                continue
-            some = np.linspace(0, len(i) - 1, min(len(i), _MOST_POINTS)).astype(int)
-            way = poses.rotation[b].T @ (poses.translation[a] - poses.translation[b])
-            way = way / max(float(np.linalg.norm(way)), 1e-12)
-            chosen.append((pixels[one][i[some]], pixels[two][j[some]], turn, way))
-            break
-    if not chosen:
-        return _Pairs(
-            np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty((0, 3))
-        )
-    first, second, turns, ways = zip(*chosen, strict=True)
-    pair = np.repeat(np.arange(len(chosen)), [len(f) for f in first])
-    return _Pairs(np.concatenate(first), np.concatenate(second), pair, np.array(turns), np.array(ways))
-
-
 def _bearings(model: CameraModel, pixels: Array, centre: Array, lens: Array) -> Array:
     """(K, 3) by the lens moved by `[log scale, shift]`; NaN where it has no ray."""
     moved = centre + (pixels - centre - lens[1:]) * np.exp(-float(lens[0]))
     return np.asarray(model.unproject(moved)[0])
 
 
-def _minimise(pairs: _Pairs, model: CameraModel, scale_std: float) -> LensFit:
+def _minimise(pairs: ViewPairs, model: CameraModel, scale_std: float) -> LensFit:
     """Gauss-Newton on Sampson distances with Cauchy's loss; the poses of the pairs are eliminated pair by pair."""
     centre = model.project(np.array([[0.0, 0.0, 1.0]]))[0][0]
     focal = _pixels_per_radian(model, centre)
@@ -174,24 +123,26 @@ def _minimise(pairs: _Pairs, model: CameraModel, scale_std: float) -> LensFit:
         state, cost_before = (R, t, lens), cost
         if done <= 3:
             given_rms = robust_std(error)
-        reduced, right, back = _eliminate(pairs, error, J_pose, J_lens, weights, damping)
+        reduced, right, back = eliminate_pairs(pairs, error, J_pose, J_lens, weights, damping)
         prior = (scale**2) / np.array([scale_std, 0.2 * focal, 0.2 * focal]) ** 2
         if done < 3:  # poses first, with the lens given
-            step_lens = np.zeros(3)
+            step_lens: Array = np.zeros(3)
         else:
-            step_lens = np.linalg.solve(reduced + np.diag(prior), right - prior * lens)
+            step_lens = np.asarray(
+                np.linalg.solve(reduced + np.diag(prior), right - prior * lens), dtype=np.float64
+            )
             damping = max(damping / 10, 1e-9)
         step_pose = back(step_lens)
         lens = lens + np.clip(
             step_lens, -0.1 * np.array([1, focal, focal]), 0.1 * np.array([1, focal, focal])
         )
-        R, t = _moved(R, t, step_pose)
+        R, t = moved_pairs(R, t, step_pose)
         if done > 4 and np.abs(step_lens / steps).max() < 0.05:
             break
     error, J_pose, J_lens = _linearise(pairs, model, centre, R, t, lens, steps)
     weights = 1 / (1 + (error / (2 * scale)) ** 2)
-    reduced, _, _ = _eliminate(pairs, error, J_pose, J_lens, weights, 1e-9)
-    covariance = _scatter(pairs, error, J_pose, J_lens, weights, reduced)
+    reduced, _, _ = eliminate_pairs(pairs, error, J_pose, J_lens, weights, 1e-9)
+    covariance = scatter_covariance(pairs, error, J_pose, J_lens, weights, reduced)
     covariance[0] *= np.exp(lens[0])
     covariance[:, 0] *= np.exp(lens[0])
     refined = robust_std(error)
@@ -205,39 +156,21 @@ def _pixels_per_radian(model: CameraModel, centre: Array) -> float:
     return float(np.mean(np.linalg.norm(model.project(small)[0] - centre, axis=1)) / 1e-3)
 
 
-def _tangents(t: Array) -> Array:
-    """(P, 3, 2) bases of the planes at right angles to unit vectors (P, 3)."""
-    axis = np.eye(3)[np.argmin(np.abs(t), axis=1)]
-    first = np.cross(t, axis)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(t, first)], axis=-1)
-
-
-def _sampson(a: Array, b: Array, R: Array, t: Array, pair: Indices) -> Array:
-    """(K,) signed Sampson distances, radians; see `geometry.two_view.sampson_angles`."""
-    E = (so3.hat(t) @ R)[pair]
-    row = np.einsum("kij,kj->ki", E, a)
-    column = np.einsum("kji,kj->ki", E, b)
-    e = np.einsum("ki,ki->k", b, row)
-    squares = np.einsum("ki,ki->k", row, row) + np.einsum("ki,ki->k", column, column) - 2 * e**2
-    return np.asarray(e / np.sqrt(np.maximum(squares, 1e-12)))
-
-
 def _linearise(
-    pairs: _Pairs, model: CameraModel, centre: Array, R: Array, t: Array, lens: Array, steps: Array
+    pairs: ViewPairs, model: CameraModel, centre: Array, R: Array, t: Array, lens: Array, steps: Array
 ) -> tuple[Array, Array, Array]:
     """Distances (K,) and their derivatives by pose (K, 5) and lens (K, 3), numerically; zero where not valid."""
     a, b = (_bearings(model, p, centre, lens) for p in (pairs.first, pairs.second))
     valid = np.asarray(np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1))
     a, b = np.where(valid[:, None], a, 1.0), np.where(valid[:, None], b, 1.0)
-    error = _sampson(a, b, R, t, pairs.pair)
-    bases, h = _tangents(t), 1e-6
+    error = sampson_distances(a, b, R, t, pairs.pair)
+    bases, h = tangents(t), 1e-6
     by_pose = np.empty((len(error), 5))
     for k in range(5):
         if k < 3:
-            moved = _sampson(a, b, so3.exp(h * np.eye(3)[k]) @ R, t, pairs.pair)
+            moved = sampson_distances(a, b, so3.exp(h * np.eye(3)[k]) @ R, t, pairs.pair)
         else:
-            moved = _sampson(a, b, R, t + h * bases[:, :, k - 3], pairs.pair)
+            moved = sampson_distances(a, b, R, t + h * bases[:, :, k - 3], pairs.pair)
         by_pose[:, k] = (moved - error) / h
     by_lens = np.empty((len(error), 3))
     for k in range(3):
@@ -245,55 +178,9 @@ def _linearise(
         a2, b2 = (_bearings(model, p, centre, off) for p in (pairs.first, pairs.second))
         good = np.asarray(np.isfinite(a2).all(axis=1) & np.isfinite(b2).all(axis=1))
         valid &= good
-        moved = _sampson(np.where(good[:, None], a2, a), np.where(good[:, None], b2, b), R, t, pairs.pair)
+        moved = sampson_distances(
+            np.where(good[:, None], a2, a), np.where(good[:, None], b2, b), R, t, pairs.pair
+        )
         by_lens[:, k] = (moved - error) / steps[k]
     keep = valid[:, None]
     return np.where(valid, error, 0.0), np.where(keep, by_pose, 0.0), np.where(keep, by_lens, 0.0)
-
-
-def _eliminate(pairs: _Pairs, error: Array, J_pose: Array, J_lens: Array, weights: Array, damping: float):  # type: ignore[no-untyped-def]
-    """Reduced information (3, 3) and right-hand side (3,) of the lens, and poses' steps for a step of the lens."""
-    starts = np.searchsorted(pairs.pair, np.arange(len(pairs.rotation)))
-
-    def summed(x: Array) -> Array:
-        return np.add.reduceat(x, starts, axis=0)
-
-    w = weights[:, None, None]
-    A = summed(w * J_pose[:, :, None] * J_pose[:, None, :])
-    B = summed(w * J_pose[:, :, None] * J_lens[:, None, :])
-    C = (w * J_lens[:, :, None] * J_lens[:, None, :]).sum(axis=0)
-    g_pose = -summed(weights[:, None] * J_pose * error[:, None])
-    g_lens = -(weights[:, None] * J_lens * error[:, None]).sum(axis=0)
-    diagonal = np.einsum("pii->pi", A)
-    A = A + np.eye(5) * (damping * diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True))[:, None, :]
-    inverse = np.linalg.inv(A)
-    reduced = C - np.einsum("pki,pkl,plj->ij", B, inverse, B)
-    right = g_lens - np.einsum("pki,pkl,pl->i", B, inverse, g_pose)
-
-    def back(step_lens: Array) -> Array:
-        return np.einsum("pkl,pl->pk", inverse, g_pose - B @ step_lens)
-
-    return reduced, right, back
-
-
-def _scatter(
-    pairs: _Pairs, error: Array, J_pose: Array, J_lens: Array, weights: Array, reduced: Array
-) -> Array:
-    """Covariance (3, 3) of the lens by the scatter of the pairs' scores, neighbouring pairs counted as one."""
-    starts = np.searchsorted(pairs.pair, np.arange(len(pairs.rotation)))
-    w = weights[:, None, None]
-    A = np.add.reduceat(w * J_pose[:, :, None] * J_pose[:, None, :], starts, axis=0)
-    B = np.add.reduceat(w * J_pose[:, :, None] * J_lens[:, None, :], starts, axis=0)
-    g_pose = np.add.reduceat(weights[:, None] * J_pose * error[:, None], starts, axis=0)
-    g_lens = np.add.reduceat(weights[:, None] * J_lens * error[:, None], starts, axis=0)
-    trace = np.einsum("pii->p", A)[:, None, None]
-    scores = g_lens - np.einsum("pki,pkl,pl->pi", B, np.linalg.inv(A + 1e-9 * trace * np.eye(5)), g_pose)
-    groups = np.add.reduceat(scores, np.arange(0, len(scores), 3), axis=0)
-    inverse = np.linalg.pinv(reduced, hermitian=True)
-    return np.asarray(inverse @ (groups.T @ groups) @ inverse)
-
-
-def _moved(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
-    step = np.clip(step, -0.3, 0.3)
-    direction = t + np.einsum("pij,pj->pi", _tangents(t), step[:, 3:])
-    return so3.exp(step[:, :3]) @ R, direction / np.linalg.norm(direction, axis=1, keepdims=True)

@@ -21,6 +21,7 @@ from rigwake.report.charts import Series, arrow_scale, image_map, line_chart, to
 from rigwake.report.content import RIG_TRAJECTORY, ReportContent, load_report_content
 from rigwake.report.extrinsics import directions, number, overview, plus_minus, time_offset, two_digits
 from rigwake.report.html_page import CLOCKS_ARE_SET_NS
+from rigwake.report.lens_displacement import lens_displacements
 from rigwake.report.motion_figures import MotionFigures, motion_of, paths_in_one_world
 from rigwake.report.picture_overlays import embed_pictures, mask_uri
 from rigwake.report.report_verdict import judge
@@ -96,6 +97,7 @@ def _values(content: ReportContent) -> dict[str, Any]:
         "checks": plain(calibration.checks),
         "provenance": plain(calibration.provenance),
         "steps": _first_guess(content),
+        "displacements": lens_displacements(calibration),
         "statistics": {name: plain(c.statistics) for name, c in calibration.cameras.items() if c.statistics},
         "statistic_names": list(
             dict.fromkeys(key for c in calibration.cameras.values() for key in c.statistics)

@@ -17,9 +17,10 @@ from rigwake._types import Array
 from rigwake.ba.solver.covariance import RigCovariance
 from rigwake.ba.solver.rig_problem import BundleCamera, RigProblem, VectorPrior
 from rigwake.cameras.protocol import CameraModel
+from rigwake.cameras.registry import camera_to_dict
 
-IntrinsicsChoice = Literal["fixed", "refine"]
-"""What to do about intrinsics: trust them, or refine them with the rig."""
+IntrinsicsChoice = Literal["fixed", "refine", "find"]
+"""What to do about intrinsics: trust them, refine them with the rig, or find them from the motion and then refine."""
 
 _FOCAL = frozenset({"fx", "fy", "mu", "mv", "a0"})
 _CENTRE = frozenset({"cx", "cy", "u0", "v0"})
@@ -300,7 +301,7 @@ def _one_camera(
 
     return {
         "given": by_name(given.params) if given.param_names == names else {},
-        "given_model": given.model,
+        "given_camera": camera_to_dict(given),
         "found": by_name(camera.model.params),
         "std": by_name(np.sqrt(np.diag(spread))),
         "prior_std": by_name(before),
