@@ -19,14 +19,15 @@ from pathlib import Path
 
 import numpy as np
 
+from rigwake.monitor.cues import CUES, fuse, score_cues
 from rigwake.monitor.innovations import belief_of
 from rigwake.monitor.judge import judge_blocks
 from rigwake.monitor.rig_motion import rig_motion
-from rigwake.monitor.score import BLOCK_S, BlockScores, GyroBias, join_blocks, score_blocks
+from rigwake.monitor.score import BLOCK_S, BlockScores, GyroBias, join_blocks
 from rigwake.monitor.thresholds import Thresholds
 from rigwake.rig import Rig
 from rigwake.simulation.setup import build_recording, prepare
-from rigwake.simulation.track_stream import stream_tracks
+from rigwake.simulation.track_stream import stream_sightings
 from rigwake.simulation.tracks_only import NoFrames
 from rigwake.simulation.watch import calibration_of, rig_in_imu_frame, watch_scenario
 
@@ -35,22 +36,25 @@ LOOKS_SMALLER = 0.8
 BEFORE, AFTER = 13, 19  # blocks before and after the step
 
 
-def scored_watch(motion: str, duration_s: float, seed: int) -> tuple[BlockScores, Rig, float]:
-    """Scores of a watch without a fault, its rig, and the processor time per second of the watch."""
+def scored_watch(motion: str, duration_s: float, seed: int) -> tuple[dict[str, BlockScores], Rig, float]:
+    """Scores of a watch without a fault by cue, its rig, and the processor time per second of the watch."""
     scenario = watch_scenario(motion, duration_s, seed)  # type: ignore[arg-type]
     simulation = prepare(scenario)
     recording = build_recording(simulation, {c.name: NoFrames() for c in scenario.cameras}, Path("watch"))
     rig = rig_in_imu_frame(simulation.rig)
     moved = rig_motion(recording.imus["imu"], recording.gnss["gnss"], np.array(rig.antenna_rig))
-    bias, parts, spent = None, [], 0.0
-    for first_s, tracks in stream_tracks(simulation, BLOCK_S):
+    bias, parts, spent = None, {name: [] for name in CUES}, 0.0
+    for first_s, tracks, views in stream_sightings(simulation, BLOCK_S):
         began = time.process_time()
         start = np.array([simulation.start_ns + round(first_s * 1e9)])
-        parts.append(score_blocks(tracks, rig, moved, starts_ns=start, bias=bias))
-        if np.isfinite(parts[-1].bias).all():
-            bias = GyroBias(parts[-1].bias[-1], 2e-4)
+        scores = score_cues(tracks, views, rig, moved, starts_ns=start, bias=bias)
+        for name, part in scores.items():
+            parts[name].append(part)
+        found = scores[CUES[0]].bias
+        if np.isfinite(found).all():
+            bias = GyroBias(found[-1], 2e-4)
         spent += time.process_time() - began
-    return join_blocks(parts), rig, spent / duration_s
+    return {name: join_blocks(part) for name, part in parts.items()}, rig, spent / duration_s
 
 
 def with_calibration_errors(scores: BlockScores, seed: int) -> BlockScores:

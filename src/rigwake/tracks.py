@@ -35,6 +35,35 @@ class TrackingReport:
 
 
 @dataclass(frozen=True, eq=False)
+class CrossViews:
+    """M points that one camera tracked for about a second and another one saw, too.
+
+    source, target: (M,) indices into `cameras`. first_ns, later_ns: (M,) when the source saw it, its clock. seen_ns:
+    (M,) when the target did, its clock. first, later, seen: (M, 3) bearings in the frames of these cameras. std: (M, 3)
+    radians of the three. cluster: (M,) which track of all.
+    """
+
+    cameras: tuple[str, ...]
+    source: Indices
+    target: Indices
+    first_ns: Indices
+    later_ns: Indices
+    seen_ns: Indices
+    first: Array
+    later: Array
+    seen: Array
+    std: Array
+    cluster: Indices
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def take(self, index: Indices) -> CrossViews:
+        """The chosen views."""
+        return take_rows(self, index, keep=("cameras",))
+
+
+@dataclass(frozen=True, eq=False)
 class Tracks:
     """Feature observations of one camera, sorted by frame, then by track.
 

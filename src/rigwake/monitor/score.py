@@ -121,20 +121,39 @@ def score_blocks(
     tracks: of every camera of the rig. rig: in the IMU's frame (`rig_motion.py`), every number known. starts_ns: of the
     blocks; from the first to the last frame by default. bias: of the gyro, where it is known from before.
     """
+    return score_blocks_with_motion(tracks, rig, motion, starts_ns=starts_ns, bias=bias, stride=stride)[0]
+
+
+def score_blocks_with_motion(
+    tracks: Mapping[str, Tracks],
+    rig: Rig,
+    motion: RigMotion,
+    *,
+    starts_ns: Indices | None = None,
+    bias: GyroBias | None = None,
+    stride: int = 1,
+) -> tuple[BlockScores, list[BlockMotion | None]]:
+    """As `score_blocks`, and how the rig moved in every block, None where it made too little way."""
     if starts_ns is None:
         starts_ns = block_starts(tracks, rig, motion)
     bias = bias or GyroBias.unknown()
-    blocks = []
+    blocks, motions = [], []
     for start in starts_ns.tolist():
-        pairs = pair_frames(tracks, rig, start, start + round(BLOCK_S * 1e9), stride=stride)
-        block, found = score_block(pairs, rig, motion, start, bias)
+        pairs = _above_water(
+            pair_frames(tracks, rig, start, start + round(BLOCK_S * 1e9), stride=stride), motion
+        )
+        moved = block_motion(pairs, rig, motion, bias)
+        block, found = score_block(moved, rig, motion, start, bias)
         if bias.std >= _BIAS_START_STD and found.std < bias.std:  # once more: it was linearised far off
-            block, found = score_block(pairs, rig, motion, start, GyroBias(found.value, _BIAS_AGAIN_STD))
+            bias = GyroBias(found.value, _BIAS_AGAIN_STD)
+            moved = block_motion(pairs, rig, motion, bias)
+            block, found = score_block(moved, rig, motion, start, bias)
         bias = found
         blocks.append(block)
+        motions.append(moved)
     if not blocks:
-        return _nothing(tuple(rig.cameras), np.empty(0, dtype=np.int64))
-    return join_blocks(blocks)
+        return _nothing(tuple(rig.cameras), np.empty(0, dtype=np.int64)), []
+    return join_blocks(blocks), motions
 
 
 def block_starts(tracks: Mapping[str, Tracks], rig: Rig, motion: RigMotion) -> Indices:
@@ -154,15 +173,29 @@ def block_starts(tracks: Mapping[str, Tracks], rig: Rig, motion: RigMotion) -> I
     return first + block * np.arange(max(count, 0), dtype=np.int64)
 
 
-def score_block(
-    pairs: EpipolarPairs, rig: Rig, motion: RigMotion, start_ns: int, bias: GyroBias
-) -> tuple[BlockScores, GyroBias]:
-    """One block, and what is known of the gyro's bias after it."""
-    pairs = _above_water(pairs, motion)
-    size = MOUNTING * len(pairs.cameras)
-    empty = _nothing(pairs.cameras, np.array([start_ns], dtype=np.int64))
+@dataclass(frozen=True, eq=False)
+class BlockMotion:
+    """How the rig moved in a block, from all cameras as they are calibrated.
+
+    pairs: that show it. place: (P, 3) of each pair's camera. between: of the pairs. velocity: (S, 3) of the slots,
+    level axes. way: (P, 3) of each pair's camera. scale: (C,) residuals over what tracks predict. bias: of the
+    gyro, as it was taken.
+    """
+
+    pairs: EpipolarPairs
+    place: Array
+    between: PairMotion
+    priors: VelocityPriors
+    velocity: Array
+    way: Array
+    scale: Array
+    bias: GyroBias
+
+
+def block_motion(pairs: EpipolarPairs, rig: Rig, motion: RigMotion, bias: GyroBias) -> BlockMotion | None:
+    """How the rig moved by pairs above the water; None where it made too little way, or too little was tracked."""
     if len(pairs.pair) < _FEWEST_ROWS:
-        return empty, bias
+        return None
     place = np.stack([rig.camera(name).rig_from_cam.translation for name in pairs.cameras])[pairs.camera]
     slots = slots_of(pairs, motion, _spacing(pairs))
     between = motion.between(pairs.first_ns, pairs.second_ns, slots.reference_ns[slots.slot], bias.value)
@@ -172,10 +205,22 @@ def score_block(
     velocity, way = solve_velocities(pairs, between, priors, place, scale[pairs.camera])
     pairs = without_slow(pairs, way, _LEAST_WAY_M)
     if len(pairs.pair) < _FEWEST_ROWS:
-        return empty, bias
+        return None
     for _ in range(2):
         scale = _noise(_residuals(pairs, between.rotation, way), pairs)
         velocity, way = solve_velocities(pairs, between, priors, place, scale[pairs.camera], velocity, 3)
+    return BlockMotion(pairs, place, between, priors, velocity, way, scale, bias)
+
+
+def score_block(
+    moved: BlockMotion | None, rig: Rig, motion: RigMotion, start_ns: int, bias: GyroBias
+) -> tuple[BlockScores, GyroBias]:
+    """One block, and what is known of the gyro's bias after it."""
+    size = MOUNTING * len(rig.cameras)
+    if moved is None:
+        return _nothing(tuple(rig.cameras), np.array([start_ns], dtype=np.int64)), bias
+    pairs, between, way, scale = moved.pairs, moved.between, moved.way, moved.scale
+    slots = moved.priors.slots
     residual = _residuals(pairs, between.rotation, way)
     whitened = residual / (_SCORE_LOSS_STDS * scale[pairs.camera][pairs.pair])
     weight = 1 / (1 + whitened**2) / scale[pairs.camera][pairs.pair] ** 2
@@ -190,7 +235,7 @@ def score_block(
         between.rotation,
         way,
         between.by_velocity,
-        place,
+        moved.place,
         between.turning,
         between.drift,
         between.turning_first,
@@ -198,7 +243,7 @@ def score_block(
         rows,
     )
     products = products + np.tril(products, -1).transpose(0, 2, 1)
-    H, g, new_bias = _eliminate(products, pairs, priors, velocity, motion.gyro_noise, bias)
+    H, g, new_bias = _eliminate(products, pairs, moved.priors, moved.velocity, motion.gyro_noise, bias)
     counts = np.bincount(pairs.camera[pairs.pair], minlength=len(pairs.cameras))
     poor = np.repeat(counts < _FEWEST_ROWS, MOUNTING)
     H[poor, :], H[:, poor], g[poor] = 0.0, 0.0, 0.0
@@ -212,7 +257,7 @@ def score_block(
         _inflation(rows, weight, pairs)[None],
         scale[None],
         counts[None],
-        np.array([float(np.median(np.linalg.norm(velocity, axis=1)))]),
+        np.array([float(np.median(np.linalg.norm(moved.velocity, axis=1)))]),
         np.array([float(np.sqrt(np.mean(rates**2)))]),
         up[None] / np.linalg.norm(up),
         _sectors(rows, weight, pairs)[None],
