@@ -19,11 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rigwake.monitor.cues import CUES, fuse, score_cues
+from rigwake.monitor.block_motion import GyroBias
+from rigwake.monitor.cues import CUES, score_cues
 from rigwake.monitor.innovations import belief_of
 from rigwake.monitor.judge import judge_blocks
 from rigwake.monitor.rig_motion import rig_motion
-from rigwake.monitor.score import BLOCK_S, BlockScores, GyroBias, join_blocks
+from rigwake.monitor.score import BLOCK_S, BlockScores, join_blocks, score_blocks_with_motion
 from rigwake.monitor.thresholds import Thresholds
 from rigwake.rig import Rig
 from rigwake.simulation.setup import build_recording, prepare
@@ -47,7 +48,8 @@ def scored_watch(motion: str, duration_s: float, seed: int) -> tuple[dict[str, B
     for first_s, tracks, views in stream_sightings(simulation, BLOCK_S):
         began = time.process_time()
         start = np.array([simulation.start_ns + round(first_s * 1e9)])
-        scores = score_cues(tracks, views, rig, moved, starts_ns=start, bias=bias)
+        alone, motions = score_blocks_with_motion(tracks, rig, moved, starts_ns=start, bias=bias)
+        scores = score_cues(alone, motions, views, rig, moved)
         for name, part in scores.items():
             parts[name].append(part)
         found = scores[CUES[0]].bias

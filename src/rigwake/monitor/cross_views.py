@@ -19,9 +19,10 @@ import numpy as np
 from rigwake._robust import MAD_TO_STD
 from rigwake._types import Array, Indices, Mask
 from rigwake.geometry import so3
+from rigwake.monitor.block_motion import BlockMotion
 from rigwake.monitor.pair_kernels import MOUNTING, sum_by
 from rigwake.monitor.rig_motion import PairMotion, RigMotion
-from rigwake.monitor.score import BlockMotion, BlockScores
+from rigwake.monitor.score import BlockScores
 from rigwake.rig import Rig
 from rigwake.tracks import CrossViews
 
@@ -94,20 +95,15 @@ def score_cross_views(
 
 
 def _motions(views: CrossViews, rig: Rig, motion: RigMotion, found: BlockMotion | None) -> _Seen:
-    offsets = np.array([round(rig.camera(name).time_offset_s * 1e9) for name in views.cameras])
-    first = views.first_ns + offsets[views.source]
-    later, other = views.later_ns + offsets[views.source], views.seen_ns + offsets[views.target]
+    offsets = {name: camera.time_offset_s for name, camera in rig.cameras.items()}
+    first, later, other = views.rig_times_ns(offsets)
     lag = (other - first) * 1e-9
     if found is None:
         reference, velocity, bias = first, np.zeros((len(first), 3)), np.zeros(3)
         moving = np.zeros(len(first), dtype=bool)
     else:
-        slots = found.priors.slots
-        at = np.clip(np.searchsorted(slots.first_ns, first), 0, len(slots.first_ns) - 1)
-        before = np.maximum(at - 1, 0)
-        at = np.where(np.abs(slots.first_ns[before] - first) < np.abs(slots.first_ns[at] - first), before, at)
-        reference, velocity, bias = slots.reference_ns[at], found.velocity[at], found.bias.value
-        moving = np.abs(slots.first_ns[at] - first) < 0.5e9
+        at, moving = found.slot_at(first)
+        reference, velocity, bias = found.priors.slots.reference_ns[at], found.velocity[at], found.bias.value
     ways = [motion.between(first, end, reference, bias) for end in (later, other)]
     return _Seen(views, ways[0], ways[1], velocity, lag, moving)
 
@@ -127,7 +123,7 @@ def _residuals(seen: _Seen, mounts: _Mounts) -> tuple[Array, Array]:
     after = _times(rotation, _times(mounts.source_turn, views.later))
     way = _times(by_velocity, velocity) + known
     way += _times(rotation, mounts.source_place) - mounts.source_place
-    inverse_range, range_std = _inverse_ranges(u, after, way, views.std, seen.moving)
+    inverse_range, range_std = inverse_ranges(u, after, way, views.std, seen.moving)
     rotation, by_velocity, known = seen.other.rotation, seen.other.by_velocity, seen.other.known
     place = _times(rotation, mounts.target_place) + known
     place += _times(by_velocity, velocity)
@@ -147,8 +143,12 @@ def _residuals(seen: _Seen, mounts: _Mounts) -> tuple[Array, Array]:
     return residual, np.sqrt(np.stack([noise, noise + by_range**2], axis=1))
 
 
-def _inverse_ranges(u: Array, after: Array, way: Array, std: Array, moving: Mask) -> tuple[Array, Array]:
-    """(M,) 1/m and standard deviations: from the track's parallax, and what is usual."""
+def inverse_ranges(u: Array, after: Array, way: Array, std: Array, moving: Mask) -> tuple[Array, Array]:
+    """(M,) 1/m and standard deviations: from the track's parallax, and what is usual.
+
+    u, after: (M, 3) bearings of the first and the later sighting, way: (M, 3) between them, all in rig axes at the
+    first. std: (M, 2) or more, radians. moving: (M,) whether the way is known.
+    """
     normal = np.cross(u, after)
     side = np.linalg.norm(way - (way * u).sum(axis=1, keepdims=True) * u, axis=1)
     forward = (np.cross(way, after) * normal).sum(axis=1)

@@ -2,36 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from rigwake._types import Indices
+from rigwake.monitor.block_motion import BlockMotion
 from rigwake.monitor.cross_views import score_cross_views
 from rigwake.monitor.innovations import PARTS, spreads
 from rigwake.monitor.pair_kernels import MOUNTING
 from rigwake.monitor.rig_motion import RigMotion
-from rigwake.monitor.score import BLOCK_S, BlockScores, GyroBias, join_blocks, score_blocks_with_motion
+from rigwake.monitor.score import BLOCK_S, BlockScores, join_blocks
 from rigwake.rig import Rig
-from rigwake.tracks import CrossViews, Tracks
+from rigwake.tracks import CrossViews
 
 CUES = ("ego-motion", "overlap", "landmarks")
 
 
 def score_cues(
-    tracks: Mapping[str, Tracks],
+    scores: BlockScores,
+    motions: Sequence[BlockMotion | None],
     views: CrossViews,
     rig: Rig,
     motion: RigMotion,
-    *,
-    starts_ns: Indices | None = None,
-    bias: GyroBias | None = None,
 ) -> dict[str, BlockScores]:
-    """Scores of every block by each of `CUES`. Arguments as of `score_blocks`; views: what two cameras saw."""
-    scores, motions = score_blocks_with_motion(tracks, rig, motion, starts_ns=starts_ns, bias=bias)
-    offsets = np.array([round(rig.camera(name).time_offset_s * 1e9) for name in views.cameras])
-    first = views.first_ns + offsets[views.source]
+    """Scores of every block by each of `CUES`.
+
+    scores, motions: of `score_blocks_with_motion`. views: what two cameras saw.
+    """
+    first = views.rig_times_ns({name: camera.time_offset_s for name, camera in rig.cameras.items()})[0]
     parts: dict[str, list[BlockScores]] = {name: [] for name in CUES[1:]}
     for k, (start, found) in enumerate(zip(scores.starts_ns.tolist(), motions, strict=True)):
         own = views.take(np.flatnonzero((first >= start) & (first < start + round(BLOCK_S * 1e9))))
@@ -41,20 +40,29 @@ def score_cues(
     return {CUES[0]: scores} | {name: join_blocks(p) if p else scores for name, p in parts.items()}
 
 
+def weighted(scores: BlockScores) -> BlockScores:
+    """Scores whose covariance is their `H`: over what they scatter within and between blocks up to each."""
+    wide = np.repeat(scores.inflation, MOUNTING, axis=1)
+    spread = spreads(scores)
+    for part in PARTS:
+        for c in range(len(scores.cameras)):
+            wide[:, scores.columns(c, part)] *= spread[:, c, part, None]
+    root = np.sqrt(wide)
+    return replace(
+        scores,
+        H=scores.H / (root[:, :, None] * root[:, None, :]),
+        g=scores.g / wide,
+        inflation=np.ones_like(scores.inflation),
+        sectors=scores.sectors / scores.inflation[:, :, None, None, None],
+    )
+
+
 def fuse(cues: Sequence[BlockScores]) -> BlockScores:
-    """Scores of all cues together, each weighted by how much it scatters within and between blocks so far."""
-    first = cues[0]
-    if len(cues) == 1:
-        return first
-    H, g = np.zeros_like(first.H), np.zeros_like(first.g)
-    for scores in cues:
-        wide = np.repeat(scores.inflation, MOUNTING, axis=1)
-        spread = spreads(scores)
-        for part in PARTS:
-            for c in range(len(scores.cameras)):
-                wide[:, scores.columns(c, part)] *= spread[:, c, part, None]
-        root = np.sqrt(wide)
-        H += scores.H / (root[:, :, None] * root[:, None, :])
-        g += scores.g / wide
-    rows = np.sum([scores.rows for scores in cues], axis=0)
-    return replace(first, H=H, g=g, rows=rows, inflation=np.ones_like(first.inflation))
+    """Scores of all cues together, each by its weight; conditions are those of the first."""
+    own = [weighted(scores) for scores in cues]
+    return replace(
+        own[0],
+        H=np.sum([scores.H for scores in own], axis=0),
+        g=np.sum([scores.g for scores in own], axis=0),
+        rows=np.sum([scores.rows for scores in own], axis=0),
+    )

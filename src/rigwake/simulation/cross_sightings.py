@@ -63,10 +63,7 @@ def simulate_cross_views(
                     )
                 )
     if not rows:
-        none, no_bearing = np.empty(0, dtype=np.int64), np.empty((0, 3))
-        return CrossViews(
-            names, none, none, none, none, none, no_bearing, no_bearing, no_bearing, no_bearing, none
-        )
+        return CrossViews.nothing(names)
     return CrossViews(names, *(np.concatenate(column) for column in zip(*rows, strict=True)))
 
 
