@@ -23,9 +23,9 @@ import numpy as np
 
 from rigwake.monitor.block_motion import GyroBias
 from rigwake.monitor.change_detection import glr
-from rigwake.monitor.cues import CUES, score_cues, weighted
+from rigwake.monitor.cues import CUES, score_cues, weighted_cues
 from rigwake.monitor.innovations import belief_of, innovations
-from rigwake.monitor.judge import Judgement, judge_blocks
+from rigwake.monitor.judge import Judgement, judge_cues
 from rigwake.monitor.rig_motion import rig_motion
 from rigwake.monitor.score import BLOCK_S, BlockScores, join_blocks, score_blocks_with_motion
 from rigwake.monitor.thresholds import Thresholds
@@ -106,17 +106,28 @@ def calibration_error(cameras: int, seed: int) -> np.ndarray:
     return error
 
 
-def judged(scores: BlockScores, rig: Rig, alone: BlockScores | None = None) -> Judgement:
-    """What the monitor says of scores."""
+def judged(
+    run: Run,
+    blocks: slice,
+    error: np.ndarray,
+    change: np.ndarray | None = None,
+    since: np.ndarray | None = None,
+) -> Judgement:
+    """What the monitor says of a part of a run."""
     thresholds = Thresholds()
-    belief = belief_of(calibration_of(rig), scores.cameras, thresholds)
-    places = {name: camera.rig_from_cam.translation for name, camera in rig.cameras.items()}
-    return judge_blocks(scores, belief, places, thresholds, alone=alone)
+    together = run.together(blocks, error, change, since)
+    alone = run.alone.take(blocks)
+    g = alone.g - alone.H @ error
+    if change is not None and since is not None:
+        g = g + since[:, None] * LOOKS_SMALLER[CUES[0]] * (alone.H @ change)
+    belief = belief_of(calibration_of(run.rig), alone.cameras, thresholds)
+    places = {name: camera.rig_from_cam.translation for name, camera in run.rig.cameras.items()}
+    return judge_cues(together, replace(alone, g=g), belief, places, thresholds)
 
 
 def statistic(scores: BlockScores, rig: Rig) -> np.ndarray:
     """(B,) the largest of all cameras."""
-    thresholds = Thresholds()
+    thresholds = Thresholds(steady_lag=10**6)
     belief = belief_of(calibration_of(rig), scores.cameras, thresholds)
     return np.asarray(glr(innovations(scores, belief, thresholds), thresholds).value.max(axis=1))
 
@@ -149,7 +160,7 @@ def false_alarms(motion: str, runs: list[Run]) -> None:
     alarms, largest, marks = 0, 0.0, []
     for seed, run in enumerate(runs):
         error = calibration_error(len(run.alone.cameras), seed)
-        judgement = judged(run.together(slice(0, len(run.alone)), error), run.rig, run.alone)
+        judgement = judged(run, slice(0, len(run.alone)), error)
         alarms += len(judgement.alarms)
         value = judgement.statistics.value.max(axis=1)
         largest = max(largest, float(value.max()))
@@ -173,7 +184,7 @@ def rate_per_100_hours(marks: np.ndarray, alarm: float, draws: int = 2000) -> tu
         middle = float(np.median(drawn))
         beyond = drawn[drawn > middle] - middle
         tail = float(beyond.mean()) if len(beyond) else 1e-6
-        rates.append(1200 * 0.5 * float(np.exp(-(alarm - middle) / tail)))
+        rates.append(1200 * 0.5 * float(np.exp(min((middle - alarm) / tail, 0.0))))
     return float(np.median(rates)), float(np.quantile(rates, 0.95))
 
 
@@ -188,7 +199,7 @@ def steps(motion: str, runs: list[Run], draws: int) -> None:
             metric = np.deg2rad(size) if cause == "rotation" else size / 100
             column = axis if cause == "rotation" else 3 + axis
             blocks, error, change, since = changed(run, draw, [column], metric)
-            judgement = judged(run.together(blocks, error, change, since), run.rig)
+            judgement = judged(run, blocks, error, change, since)
             delay, named = delay_of(judgement, cause, run.alone.cameras[draw % len(run.alone.cameras)])
             delays.append(delay)
             right.append(named)
@@ -210,8 +221,8 @@ def ramps(motion: str, runs: list[Run], rate_deg_per_hour: float = 0.3) -> None:
             change = np.zeros(7 * cameras)
             change[axis] = np.deg2rad(rate_deg_per_hour) / LOOKS_SMALLER["ego-motion"]
             since = (np.arange(count) + 0.5) * BLOCK_S / 3600
-            scores = run.together(slice(0, count), calibration_error(cameras, axis), change, since)
-            alarm = judged(scores, run.rig).alarm_of(run.alone.cameras[0])
+            judgement = judged(run, slice(0, count), calibration_error(cameras, axis), change, since)
+            alarm = judgement.alarm_of(run.alone.cameras[0])
             words = "not found"
             if alarm is not None and alarm.change is not None:
                 at = rate_deg_per_hour * (alarm.block + 1) * BLOCK_S / 3600
@@ -340,7 +351,7 @@ def kept_or_scored(motion: str, minutes: float, seed: int, folder: Path | None) 
                 if f.name != "cameras"
             }
             np.savez_compressed(kept, **arrays, cameras=np.array(cues[CUES[0]].cameras))
-    return Run({name: weighted(part) for name, part in cues.items()}, cues[CUES[0]], rig)
+    return Run(weighted_cues(cues), cues[CUES[0]], rig)
 
 
 def main() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from rigwake.rig import Rig
 from rigwake.tracks import CrossViews
 
 CUES = ("ego-motion", "overlap", "landmarks")
+_LIVELY_RATE = np.deg2rad(8.0)  # rad/s
 
 
 def score_cues(
@@ -57,9 +58,28 @@ def weighted(scores: BlockScores) -> BlockScores:
     )
 
 
-def fuse(cues: Sequence[BlockScores]) -> BlockScores:
+def weighted_cues(cues: Mapping[str, BlockScores]) -> dict[str, BlockScores]:
+    """Every cue as it counts among the others: weighted, and landmarks only in turns.
+
+    On straight and gentle courses over open water an error of the velocity, or of the gyro's bias, moves all ranges and
+    with them every landmark alike, block after block; turns average it.
+    """
+    lively = cues[CUES[0]].turning >= _LIVELY_RATE
+    own = dict(cues)
+    if "landmarks" in own:
+        marks = own["landmarks"]
+        own["landmarks"] = replace(
+            marks,
+            H=marks.H * lively[:, None, None],
+            g=marks.g * lively[:, None],
+            rows=marks.rows * lively[:, None],
+        )
+    return {name: weighted(scores) for name, scores in own.items()}
+
+
+def fuse(cues: Mapping[str, BlockScores]) -> BlockScores:
     """Scores of all cues together, each by its weight; conditions are those of the first."""
-    own = [weighted(scores) for scores in cues]
+    own = list(weighted_cues(cues).values())
     return replace(
         own[0],
         H=np.sum([scores.H for scores in own], axis=0),

@@ -16,6 +16,8 @@ from rigwake.monitor.score import BlockScores
 from rigwake.monitor.states import CameraState, Standing, next_standing
 from rigwake.monitor.thresholds import Thresholds
 
+_NEVER = 2**31  # blocks
+
 
 @dataclass(frozen=True, eq=False)
 class Alarm:
@@ -60,6 +62,26 @@ class Judgement:
             if alarm.camera == camera or alarm.explanations[0].camera == camera:
                 return alarm
         return None
+
+
+def judge_cues(
+    together: BlockScores,
+    alone: BlockScores,
+    belief: Belief,
+    places: Mapping[str, Array],
+    thresholds: Thresholds,
+    axes: Array | None = None,
+) -> Judgement:
+    """As `judge_blocks`, of all cues and of the motion alone; the earlier alarm counts.
+
+    Cues together are held against the calibration only: that they are steady to better than that was not seen, since
+    what each has wrong lasts for minutes. The motion alone is held against what it said a minute before, too.
+    """
+    never = replace(thresholds, steady_lag=_NEVER)
+    fused = judge_blocks(together, belief, places, never, axes, alone=alone)
+    single = judge_blocks(alone, belief, places, thresholds, axes)
+    first = [min((alarm.block for alarm in j.alarms), default=_NEVER) for j in (fused, single)]
+    return single if first[1] < first[0] else fused
 
 
 def judge_blocks(

@@ -18,7 +18,7 @@ from rigwake.monitor.cross_search import find_cross_views
 from rigwake.monitor.cues import fuse, score_cues
 from rigwake.monitor.hull_edges import HullCue, hull_cues
 from rigwake.monitor.innovations import belief_of
-from rigwake.monitor.judge import Alarm, Judgement, judge_blocks
+from rigwake.monitor.judge import Alarm, Judgement, judge_cues
 from rigwake.monitor.rig_motion import RigMotion, rig_motion
 from rigwake.monitor.score import BLOCK_S, BlockScores, block_starts, score_blocks_with_motion
 from rigwake.monitor.states import CameraState
@@ -138,12 +138,12 @@ def monitor(
     progress("monitor", "looking for what two cameras see", 0.3)
     views = find_cross_views(tracks, monitored.streams, monitored.rig, motion, motions)
     cues = score_cues(alone, motions, views, monitored.rig, motion)
-    scores = fuse(list(cues.values()))
+    scores = fuse(cues)
     belief = belief_of(monitored.calibration, scores.cameras, thresholds)
     up = scores.gravity.mean(axis=0)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0.0, 0.0, 1.0])
     axes = camera_axes(monitored.rig, up)
-    judgement = judge_blocks(scores, belief, monitored.places, thresholds, axes, alone=alone)
+    judgement = judge_cues(scores, alone, belief, monitored.places, thresholds, axes)
     progress("monitor", "measuring what moved", 0.8)
     verdicts = {
         name: _verdict(name, judgement, (tracks, views), monitored, motion, axes[k], thresholds)
@@ -277,7 +277,7 @@ def refined_step(
     for _ in range(_REFINE_ROUNDS):
         turned = _turned(rig, camera, rotation)
         alone, motions = score_blocks_with_motion(seen[0], turned, motion, starts_ns=starts_ns)
-        scores = fuse(list(score_cues(alone, motions, seen[1], turned, motion).values()))
+        scores = fuse(score_cues(alone, motions, seen[1], turned, motion))
         at = scores.columns(k)
         H, g = scores.H[:, at, at].sum(axis=0), scores.g[:, at].sum(axis=0)
         noise = np.einsum("bij,b->ij", scores.H[:, at, at], scores.inflation[:, k])
