@@ -44,7 +44,7 @@ _TURN, _SHIFT = 1e-5, 1e-4  # of numeric derivatives: radians; metres, seconds, 
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _LinkedViews:
     """M second views, and how the rig moves from the first sighting to the later one of the same camera, and to the
     other camera's. velocity: (M, 3), level axes. lag_s: (M,). moving: (M,) whether the rig's way is known.
     """
@@ -94,7 +94,7 @@ def score_cross_views(
     return parts[0], parts[1]
 
 
-def _motions(views: CrossViews, rig: Rig, motion: RigMotion, found: BlockMotion | None) -> _Seen:
+def _motions(views: CrossViews, rig: Rig, motion: RigMotion, found: BlockMotion | None) -> _LinkedViews:
     offsets = {name: camera.time_offset_s for name, camera in rig.cameras.items()}
     first, later, other = views.rig_times_ns(offsets)
     lag = (other - first) * 1e-9
@@ -105,7 +105,7 @@ def _motions(views: CrossViews, rig: Rig, motion: RigMotion, found: BlockMotion 
         at, moving = found.slot_at(first)
         reference, velocity, bias = found.priors.slots.reference_ns[at], found.velocity[at], found.bias.value
     ways = [motion.between(first, end, reference, bias) for end in (later, other)]
-    return _Seen(views, ways[0], ways[1], velocity, lag, moving)
+    return _LinkedViews(views, ways[0], ways[1], velocity, lag, moving)
 
 
 def _mounts(views: CrossViews, rig: Rig) -> _Mounts:
@@ -114,7 +114,7 @@ def _mounts(views: CrossViews, rig: Rig) -> _Mounts:
     return _Mounts(turns[views.source], places[views.source], turns[views.target], places[views.target])
 
 
-def _residuals(seen: _Seen, mounts: _Mounts) -> tuple[Array, Array]:
+def _residuals(seen: _LinkedViews, mounts: _Mounts) -> tuple[Array, Array]:
     """Angles (M, 2) across and within the epipolar plane, and their standard deviations, radians."""
     velocity = seen.velocity
     views = seen.views
@@ -165,10 +165,10 @@ def _times(matrices: Array, vectors: Array) -> Array:
     return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
 
 
-def _jacobian(seen: _Seen, mounts: _Mounts) -> Array:
+def _jacobian(seen: _LinkedViews, mounts: _Mounts) -> Array:
     """(M, 2, 19): by rotation and place of the source, of the target, the target's clock, the rig's velocity and the
     gyro's bias; numeric."""
-    changed: list[tuple[float, _Seen, _Mounts]] = []
+    changed: list[tuple[float, _LinkedViews, _Mounts]] = []
     for turn, place in (("source_turn", "source_place"), ("target_turn", "target_place")):
         for axis in np.eye(3):
             turned = so3.exp(_TURN * axis) @ getattr(mounts, turn)
@@ -184,7 +184,7 @@ def _jacobian(seen: _Seen, mounts: _Mounts) -> Array:
     return np.stack([(_residuals(by, on)[0] - at) / step for step, by, on in changed], axis=2)
 
 
-def _later(seen: _Seen, seconds: float) -> _Seen:
+def _later(seen: _LinkedViews, seconds: float) -> _LinkedViews:
     """As if the other camera had seen it later, the rig going on as it goes over the track's second."""
     other, span = seen.other, ((seen.views.later_ns - seen.views.first_ns) * 1e-9)[:, None]
     turned = so3.exp(so3.log(seen.later.rotation) / span * seconds)

@@ -17,7 +17,7 @@ from rigwake.rig import Rig
 from rigwake.tracks import CrossViews
 
 CUES = ("ego-motion", "overlap", "landmarks")
-_LIVELY_RATE = np.deg2rad(8.0)  # rad/s
+_LIVELY_RATE = np.deg2rad(15.0)  # rad/s
 
 
 def score_cues(
