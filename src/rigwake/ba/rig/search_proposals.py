@@ -315,7 +315,7 @@ def warped(searches: Searches, mapped: Array, options: AssociationOptions) -> Se
     warps = np.stack([right - left, below - above], axis=2) / (2 * _STENCIL_PX)
     twisted = (grid[:, 2, 2] + grid[:, 0, 0] - grid[:, 2, 0] - grid[:, 0, 2]) / 4
     curved = np.stack([right + left - twice_centre, twisted, below + above - twice_centre], axis=2)
-    good = np.isfinite(mapped).all(axis=(1, 2))
+    good: Mask = np.asarray(np.isfinite(mapped).all(axis=(1, 2)))
     stretch = np.sqrt(np.abs(np.linalg.det(np.where(good[:, None, None], warps, np.eye(2)))))
     good &= (stretch < options.max_stretch) & (stretch > 1 / options.max_stretch)
     return replace(searches, warps=warps, second_order=curved / _STENCIL_PX**2).take(np.flatnonzero(good))
