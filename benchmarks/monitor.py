@@ -49,7 +49,8 @@ def scored_watch(motion: str, duration_s: float, seed: int) -> tuple[dict[str, B
     recording = build_recording(simulation, {c.name: NoFrames() for c in scenario.cameras}, Path("watch"))
     rig = rig_in_imu_frame(simulation.rig)
     moved = rig_motion(recording.imus["imu"], recording.gnss["gnss"], np.array(rig.antenna_rig))
-    bias, parts, spent = None, {name: [] for name in CUES}, 0.0
+    parts: dict[str, list[BlockScores]] = {name: [] for name in CUES}
+    bias, spent = None, 0.0
     for first_s, tracks, views in stream_sightings(simulation, BLOCK_S):
         began = time.process_time()
         start = np.array([simulation.start_ns + round(first_s * 1e9)])
@@ -248,12 +249,12 @@ def roc(
             moved.append(statistic(run.together(blocks, error, change, since, names), run.rig)[BEFORE:])
         hours = sum(len(values) for values in quiet) * BLOCK_S / 3600
         curves[label] = [
-            (rate, delay_at(level_of(quiet, rate * hours), moved))
+            (float(rate), delay_at(level_of(quiet, rate * hours), moved))
             for rate in (60, 30, 20, 10, 6, 3)
             if rate * hours >= 1
         ]
         print(
-            f"  {label}: " + ", ".join(f"{delay:.0f} s at {rate}/h" for rate, delay in curves[label]),
+            f"  {label}: " + ", ".join(f"{delay:.0f} s at {rate:g}/h" for rate, delay in curves[label]),
             flush=True,
         )
     worst = max(

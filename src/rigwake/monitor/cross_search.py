@@ -246,6 +246,16 @@ def _views(
         bearings[seen, 2], good[seen] = model.unproject(found.pixels[seen])
         std[seen, 2] = resolution(np.nan_to_num(bearings[seen, 2])) * found.std_px[seen]
     views = CrossViews(
-        names, source, found.camera_indices, *stamps.T, *bearings.transpose(1, 0, 2), std, clusters
+        names,
+        source,
+        found.camera_indices,
+        stamps[:, 0],
+        stamps[:, 1],
+        stamps[:, 2],
+        bearings[:, 0],
+        bearings[:, 1],
+        bearings[:, 2],
+        std,
+        clusters,
     )
     return views.take(np.flatnonzero(good & np.isfinite(bearings).all(axis=(1, 2))))

@@ -105,7 +105,7 @@ def _motions(views: CrossViews, rig: Rig, motion: RigMotion, found: BlockMotion 
         at, moving = found.slot_at(first)
         reference, velocity, bias = found.priors.slots.reference_ns[at], found.velocity[at], found.bias.value
     ways = [motion.between(first, end, reference, bias) for end in (later, other)]
-    return _LinkedViews(views, ways[0], ways[1], velocity, lag, moving)
+    return _LinkedViews(views, ways[0], ways[1], velocity, np.asarray(lag, dtype=np.float64), moving)
 
 
 def _mounts(views: CrossViews, rig: Rig) -> _Mounts:

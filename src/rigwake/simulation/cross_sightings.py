@@ -31,7 +31,7 @@ def simulate_cross_views(
     stretches: by camera, each with its own rig where a fault moved one.
     """
     names = tuple(tracks)
-    rows: list[tuple[Array, ...]] = []
+    rows: list[tuple[Array | Indices, ...]] = []
     for a, source in enumerate(names):
         first, later = _second_apart(tracks[source])
         first, later = (index[truths[source].landmark_ids[first] >= 0] for index in (first, later))
