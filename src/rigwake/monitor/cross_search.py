@@ -65,7 +65,7 @@ def find_cross_views(
     for a, source in enumerate(names):
         for b, target in enumerate(names):
             for lag_s in (0.0, PAIR_S, -PAIR_S):
-                if a == b or not len(sources[source].first):
+                if a == b or not len(sources[source].first) or not len(tracks[target].timestamps_ns):
                     continue
                 found = _proposed(
                     sources[source], tracks, rig, motion, (a, b), names, offsets, usable[target], lag_s, count
