@@ -20,6 +20,7 @@ _AGREED = 0.004  # spread of the scales that cameras ask for, to be one scale
 _SIGMAS = 6.0
 _DRIFT = 2.5e-4
 _TURNED = np.deg2rad(0.2)
+_CONFIRMED = 3.0  # by which the robust cost falls when a knock is undone; one bad rotation among many gains 0.1
 _FEWEST = 8  # strides on either side of a change
 
 
@@ -150,6 +151,7 @@ def _stays(fit: TurnFit, gyro: Array, k: int) -> bool:
     """Whether the turn that stride k shows beyond the gyroscope's is there to stay: undone, all later turns fit better.
 
     A bad pose makes two such strides, which cancel; what stays may hide in the gyroscope's bias, so the bias is free.
+    A single stride proves nothing: where the later turns are too few to tell, it is no knock.
     """
     before, after = fit.residuals[k - 1], fit.residuals[k + 1]
     if min(np.linalg.norm(fit.residuals[k] + x) for x in (before, after)) < 0.5 * np.linalg.norm(
@@ -161,7 +163,7 @@ def _stays(fit: TurnFit, gyro: Array, k: int) -> bool:
     undone = fit.camera_turns.copy()
     undone[k + 1 :] = undone[k + 1 :] @ knock.T
     given = _misfit(fit.camera_turns[others], gyro[others], fit.rms, biased=True)
-    return _misfit(undone[others], gyro[others], fit.rms, biased=True) < given
+    return given - _misfit(undone[others], gyro[others], fit.rms, biased=True) > _CONFIRMED
 
 
 def _split(fit: TurnFit, gyro: Array, k: int, skipped: int) -> MountChange:
