@@ -43,8 +43,10 @@ _MOST_PIECES = 60  # segments of all members: each has a world of its own in the
 _STRIDES = 8  # that make up the recording, where its variance over a long stride is taken
 _SATURATED = 0.5  # of the variance that independent errors of the increments would have reached
 # 5 and 1 % limits of the statistic for three series (Nyblom and Harvey 2000, table 1): errors that last for seconds
-# come near the former without wandering, so the latter holds where variance does not grow with the stride either
-_STATIONARY, _SURELY_STATIONARY = 1.000, 1.359
+# come near the former without wandering. The latter holds where the poses are so many that a drift would exceed it
+# (its statistic grows with the root of their number) and where variance does not grow with the stride either
+_STATIONARY, _NOT_WANDERING = 1.000, 1.359
+_MANY_POSES = 1000
 _GROWS = (
     1.25  # variance of rotations from half a long stride to a whole: 2 for drift, 1 for errors of each pose
 )
@@ -69,7 +71,7 @@ def without_drift(
     if not all(w <= _SATURATED * stride * one for w, one in zip(whole, per_step, strict=True)):
         return problem, estimate
     grows = any(w > _GROWS * h for h, w in zip(half, whole, strict=True))
-    limit = _STATIONARY if grows else _SURELY_STATIONARY
+    limit = _STATIONARY if grows or len(estimate.valid) < _MANY_POSES else _NOT_WANDERING
     as_poses, to_beat = with_poses(problem, options), information_criterion(problem, estimate)
 
     def explains(other: HandeyeEstimate) -> bool:
