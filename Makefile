@@ -3,6 +3,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
+# compiled sources are kept: the tests start many processes, which would compile them again each time
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: demo test test-fast lint bench mutants coverage docs release-check clean
 
 $(STAMP): pyproject.toml constraints.txt
