@@ -13,7 +13,7 @@ import numpy as np
 from rigwake._types import Array, Indices
 from rigwake.recording import CameraStream
 
-# CPU-seconds on a machine of speed 1, from the profile of a recording of 40 s with four cameras: see docs/scale.md
+# CPU-seconds on a machine of speed 1, from the profile of a recording of 40 s with four cameras
 _START_S = 8.0  # loading, checks of the sensors, writing the report
 _CAMERA_S = 2.8  # per camera: lens border, hull, turns, horizon
 _FRAME_S, _MEGAPIXEL_S = 0.025, 0.020  # per frame: tracking and odometry; decoding and pyramids
