@@ -64,9 +64,12 @@ def glr(found: Innovations, thresholds: Thresholds, axes: Array | None = None) -
 
     axes: (C, 3, 3), rows, about which a camera's steps are told; the rig's by default.
     """
+    if axes is None:
+        axes = np.tile(np.eye(3), (len(found.scores.cameras), 1, 1))
     scores = found.scores
     shape = len(scores), len(scores.cameras)
     value, first, steady = np.zeros(shape), np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=bool)
+    std = np.full((*shape, 3), np.inf)
     sums = _Sums.of(found)
     for k in range(shape[0]):
         for against in (False, True):
@@ -83,19 +86,9 @@ def glr(found: Innovations, thresholds: Thresholds, axes: Array | None = None) -
             value[k] = np.where(better, largest, value[k])
             first[k] = np.where(better, starts[best], first[k])
             steady[k] = np.where(better, against, steady[k])
-    return BlockStatistics(value, first, steady, window_std_deg(found, thresholds, axes))
-
-
-def window_std_deg(found: Innovations, thresholds: Thresholds, axes: Array | None = None) -> Array:
-    """(B, C, 3) of a step over the longest window up to each block, about each camera's axes; infinite where unseen."""
-    shape = len(found.scores), len(found.scores.cameras)
-    if axes is None:
-        axes = np.tile(np.eye(3), (shape[1], 1, 1))
-    std = np.full((*shape, 3), np.inf)
-    for k in range(shape[0]):
         for c in range(shape[1]):
             std[k, c] = step_std_deg(found, c, max(k - thresholds.longest + 1, 0), k, axes[c])
-    return std
+    return BlockStatistics(value, first, steady, std)
 
 
 @dataclass(frozen=True, eq=False)

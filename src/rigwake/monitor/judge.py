@@ -9,14 +9,12 @@ import numpy as np
 
 from rigwake._types import Array
 from rigwake.monitor.blame import Explanation, bent_pictures, explain, strong_bend
-from rigwake.monitor.change_detection import BlockStatistics, Change, fit_change, glr, window_std_deg
+from rigwake.monitor.change_detection import BlockStatistics, Change, fit_change, glr
 from rigwake.monitor.innovations import Belief, Innovations, innovations
 from rigwake.monitor.pair_kernels import MOUNTING
 from rigwake.monitor.score import BlockScores
 from rigwake.monitor.states import CameraState, Standing, next_standing
 from rigwake.monitor.thresholds import Thresholds
-
-_NEVER = 2**31  # blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,39 +62,14 @@ class Judgement:
         return None
 
 
-def judge_cues(
-    together: BlockScores,
-    alone: BlockScores,
-    belief: Belief,
-    places: Mapping[str, Array],
-    thresholds: Thresholds,
-    axes: Array | None = None,
-) -> Judgement:
-    """As `judge_blocks`, of all cues and of the motion alone; the earlier alarm counts.
-
-    Cues together are held against the calibration only: that they are steady to better than that was not seen, since
-    what each has wrong lasts for minutes. The motion alone is held against what it said a minute before, too.
-    """
-    never = replace(thresholds, steady_lag=_NEVER)
-    fused = judge_blocks(together, belief, places, never, axes, alone=alone)
-    single = judge_blocks(alone, belief, places, thresholds, axes)
-    first = [min((alarm.block for alarm in j.alarms), default=_NEVER) for j in (fused, single)]
-    return single if first[1] < first[0] else fused
-
-
 def judge_blocks(
     scores: BlockScores,
     belief: Belief,
     places: Mapping[str, Array],
     thresholds: Thresholds,
     axes: Array | None = None,
-    *,
-    alone: BlockScores | None = None,
 ) -> Judgement:
-    """Detection, blame and states of all cameras over all blocks.
-
-    places: (3,) of the cameras on the rig. alone: scores by the rig's motion alone, without what compares cameras with
-    each other: only what they see counts as observable, since cameras that agree may have moved together.
+    """Detection, blame and states of all cameras over all blocks. places: (3,) of the cameras on the rig.
 
     What was explained (a camera that moved, a clock that jumped) becomes unknown from the beginning, and the rest is
     judged again: one moved camera must not make others look moved.
@@ -123,8 +96,6 @@ def judge_blocks(
         found = innovations(_released(found.scores, best), belief, thresholds)
         statistics = glr(found, thresholds, axes)
         merged = _merged(merged, statistics, names, explained)
-    if alone is not None:
-        merged = _seen_alone(merged, innovations(alone, belief, thresholds), thresholds, axes)
     step, step_std = _steps(first_found)
     standings = _standings(merged, alarms, names, thresholds)
     return Judgement(scores, standings, merged, step, step_std, tuple(alarms))
@@ -236,15 +207,6 @@ def _merged(
         np.where(kept, before.steady, after.steady),
         np.where(kept[:, None], before.std_deg, after.std_deg),
     )
-
-
-def _seen_alone(
-    statistics: BlockStatistics, alone: Innovations, thresholds: Thresholds, axes: Array | None
-) -> BlockStatistics:
-    """Standard deviations of all cues where the motion alone tells of an axis, else those of the motion."""
-    std = window_std_deg(alone, thresholds, axes)
-    seen = std <= thresholds.observable_deg
-    return replace(statistics, std_deg=np.where(seen, np.minimum(statistics.std_deg, std), std))
 
 
 def _steps(found: Innovations) -> tuple[Array, Array]:

@@ -55,12 +55,7 @@ def recalibrate(calibration: Calibration, result: MonitorResult) -> Recalibratio
         )
     monitored = result.monitored
     rotation, noise, at_new = refined_step(
-        (result.tracks, result.views),
-        monitored.rig,
-        result.motion,
-        name,
-        verdict.alarm.change.rotation,
-        starts,
+        result.tracks, monitored.rig, result.motion, name, verdict.alarm.change.rotation, starts
     )
     covariance = noise + _from_others(at_new, name, result)
     std = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(covariance)[-1])))

@@ -14,13 +14,11 @@ from rigwake.errors import EstimationError, UnobservableError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.monitor.change_detection import Change
-from rigwake.monitor.cross_search import find_cross_views
-from rigwake.monitor.cues import fuse, score_cues
 from rigwake.monitor.hull_edges import HullCue, hull_cues
 from rigwake.monitor.innovations import belief_of
-from rigwake.monitor.judge import Alarm, Judgement, judge_cues
+from rigwake.monitor.judge import Alarm, Judgement, judge_blocks
 from rigwake.monitor.rig_motion import RigMotion, rig_motion
-from rigwake.monitor.score import BLOCK_S, BlockScores, block_starts, score_blocks_with_motion
+from rigwake.monitor.score import BLOCK_S, BlockScores, block_starts, score_blocks
 from rigwake.monitor.states import CameraState
 from rigwake.monitor.thresholds import Thresholds
 from rigwake.monitor.trim import trim_change
@@ -32,7 +30,7 @@ from rigwake.tracking.hull_picture import HullPicture
 from rigwake.tracking.masks import lens_mask
 from rigwake.tracking.self_mask import find_self_mask
 from rigwake.tracking.tracking_options import TrackingOptions
-from rigwake.tracks import CrossViews, Tracks
+from rigwake.tracks import Tracks
 
 _FEWEST_BLOCKS = 2
 _REFINE_ROUNDS = 3
@@ -79,7 +77,7 @@ class CameraVerdict:
 @dataclass(frozen=True, eq=False)
 class MonitorResult:
     """verdicts: by camera. judgement: block by block. notes: in words. monitored: in the IMU's frame. hull: what the
-    own hull says, where a picture of it is kept. views: what two cameras saw. cues: scores of each."""
+    own hull says, of the cameras of which a picture of it is kept."""
 
     verdicts: Mapping[str, CameraVerdict]
     judgement: Judgement
@@ -89,8 +87,6 @@ class MonitorResult:
     notes: tuple[str, ...] = ()
     thresholds: Thresholds = field(default_factory=Thresholds)
     hull: Mapping[str, HullCue] = field(default_factory=dict)
-    views: CrossViews = field(default_factory=lambda: CrossViews.nothing(()))
-    cues: Mapping[str, BlockScores] = field(default_factory=dict)
 
     @property
     def exit_code(self) -> int:
@@ -134,30 +130,24 @@ def monitor(
     if len(starts) < _FEWEST_BLOCKS:
         _too_short(len(starts) * BLOCK_S)
     progress("monitor", "scoring", 0.0)
-    alone, motions = score_blocks_with_motion(tracks, monitored.rig, motion, starts_ns=starts)
-    progress("monitor", "looking for what two cameras see", 0.3)
-    views = find_cross_views(tracks, monitored.streams, monitored.rig, motion, motions)
-    cues = score_cues(alone, motions, views, monitored.rig, motion)
-    scores = fuse(cues)
+    scores = score_blocks(tracks, monitored.rig, motion, starts_ns=starts)
     belief = belief_of(monitored.calibration, scores.cameras, thresholds)
     up = scores.gravity.mean(axis=0)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0.0, 0.0, 1.0])
     axes = camera_axes(monitored.rig, up)
-    judgement = judge_cues(scores, alone, belief, monitored.places, thresholds, axes)
+    judgement = judge_blocks(scores, belief, monitored.places, thresholds, axes)
     progress("monitor", "measuring what moved", 0.8)
     verdicts = {
-        name: _verdict(name, judgement, (tracks, views), monitored, motion, axes[k], thresholds)
+        name: _verdict(name, judgement, tracks, monitored, motion, axes[k], thresholds)
         for k, name in enumerate(scores.cameras)
     }
     for name, why in monitored.left_out.items():
         verdicts[name] = CameraVerdict(name, CameraState.UNOBSERVABLE, np.full(3, np.inf), why)
     notes += rig_notes(judgement, thresholds)
-    on_deck = _hull(monitored, starts, hull or {}, thresholds)
-    verdicts, words = with_hull(verdicts, on_deck, monitored.rig_from_imu.rotation)
+    cues = _hull(monitored, starts, hull or {}, thresholds)
+    verdicts, words = with_hull(verdicts, cues, monitored.rig_from_imu.rotation)
     notes += words
-    return MonitorResult(
-        verdicts, judgement, monitored, motion, tracks, tuple(notes), thresholds, on_deck, views, cues
-    )
+    return MonitorResult(verdicts, judgement, monitored, motion, tracks, tuple(notes), thresholds, cues)
 
 
 def _hull(
@@ -260,7 +250,7 @@ def _fraction(progress: Progress, name: str, total: int) -> Callable[[int], None
 
 
 def refined_step(
-    seen: tuple[Mapping[str, Tracks], CrossViews],
+    tracks: Mapping[str, Tracks],
     rig: Rig,
     motion: RigMotion,
     camera: str,
@@ -270,14 +260,12 @@ def refined_step(
     """A camera's rotation (3,) rad against `rig`, its noise covariance (3, 3), and the blocks' scores at it.
 
     The blocks after the change are scored again with the camera turned, until nothing is left to turn: residuals of
-    half a degree are not small. seen: tracks, and what two cameras saw. rotation: a first value.
+    half a degree are not small. rotation: a first value.
     """
     k = list(rig.cameras).index(camera)
     scores, covariance = None, np.full((3, 3), np.nan)
     for _ in range(_REFINE_ROUNDS):
-        turned = _turned(rig, camera, rotation)
-        alone, motions = score_blocks_with_motion(seen[0], turned, motion, starts_ns=starts_ns)
-        scores = fuse(score_cues(alone, motions, seen[1], turned, motion))
+        scores = score_blocks(tracks, _turned(rig, camera, rotation), motion, starts_ns=starts_ns)
         at = scores.columns(k)
         H, g = scores.H[:, at, at].sum(axis=0), scores.g[:, at].sum(axis=0)
         noise = np.einsum("bij,b->ij", scores.H[:, at, at], scores.inflation[:, k])
@@ -297,7 +285,7 @@ def _turned(rig: Rig, camera: str, rotation: Array) -> Rig:
 def _verdict(
     name: str,
     judgement: Judgement,
-    seen: tuple[Mapping[str, Tracks], CrossViews],
+    tracks: Mapping[str, Tracks],
     monitored: MonitoredRig,
     motion: RigMotion,
     axes: Array,
@@ -308,7 +296,7 @@ def _verdict(
     state, std = judgement.standings[-1][k], judgement.statistics.std_deg[-1, k]
     alarm = judgement.alarm_of(name)
     if state is CameraState.DRIFTED and alarm is not None and alarm.change is not None:
-        return _drift(name, std, alarm, alarm.change, scores, seen, monitored, motion, axes)
+        return _drift(name, std, alarm, alarm.change, scores, tracks, monitored, motion, axes)
     if state is CameraState.SUSPECT:
         words = alarm.words if alarm is not None else "disagrees with the other cameras; watch it"
         return CameraVerdict(name, state, std, words, alarm=alarm)
@@ -323,7 +311,7 @@ def _drift(
     alarm: Alarm,
     change: Change,
     scores: BlockScores,
-    seen: tuple[Mapping[str, Tracks], CrossViews],
+    tracks: Mapping[str, Tracks],
     monitored: MonitoredRig,
     motion: RigMotion,
     axes: Array,
@@ -335,7 +323,7 @@ def _drift(
             first += 1  # the block in which it happened is of both kinds
         last = min(len(scores), first + _REFINE_BLOCKS)
         rotation, noise, _ = refined_step(
-            seen, monitored.rig, motion, name, rotation, scores.starts_ns[first:last]
+            tracks, monitored.rig, motion, name, rotation, scores.starts_ns[first:last]
         )
         covariance = noise + change.covariance / 4
     since = int(scores.starts_ns[change.block])
