@@ -251,7 +251,11 @@ def _receiver(
     trajectories: Mapping[str, Trajectory],
     repair: bool,
 ) -> tuple[GnssStream | None, list[SensorCheck]]:
-    """The receiver against the path of the camera that lasts longest; what delays it is taken off its stamps."""
+    """The receiver against the best path; what delays it is taken off its stamps.
+
+    Of the paths that last at least half as long as the longest, that which agrees best with the gyroscope: fixes far
+    from a path that jumps would be blamed for it.
+    """
     if gnss is None:
         return None, []
     imu, fits, forces = found.imu, found.fits, found.forces
@@ -259,7 +263,10 @@ def _receiver(
     level = imu is not None and bool(usable)
     if imu is not None and not usable:
         return gnss, []
-    reference_camera = max(usable, key=lambda n: len(longest_segment(trajectories[n])))
+    lasting = {n: len(longest_segment(trajectories[n])) for n in usable}
+    long_enough = [n for n in usable if 2 * lasting[n] >= max(lasting.values())]
+    misfit = {n: float(np.square(fits[n].residuals).mean()) for n in long_enough if n in fits}
+    reference_camera = min(long_enough, key=lambda n: (misfit.get(n, 0.0), -lasting[n]))
     segment = longest_segment(trajectories[reference_camera])
     force = forces[reference_camera].given if level else None
     sure = force is not None and force.scale_std < 0.05 and force.scale > 0

@@ -20,9 +20,8 @@ _AGREED = 0.004  # spread of the scales that cameras ask for, to be one scale
 _SIGMAS = 6.0
 _DRIFT = 2.5e-4
 _TURNED = np.deg2rad(0.2)
-_CONFIRMED = (
-    3.0  # by which the robust cost falls when a knock is undone; one bad rotation among many gains 0.1
-)
+# by which the robust cost falls when a knock is undone: one bad rotation among many gains 0.1
+_CONFIRMED = 3.0
 _FEWEST = 8  # strides on either side of a change
 
 

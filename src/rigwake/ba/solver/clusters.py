@@ -1,9 +1,9 @@
 """What errors that last along a track do to the shared parameters.
 
 The information matrix takes every observation's error to be independent. Those of one landmark are not: a patch
-that is drawn otherwise than its warp supposes errs the same way for seconds. The scores `u_l = G_l^T (I - H_l) r_l`
-of whole landmarks (G: how its observations pull at the shared parameters, everything else adjusting to it) are
-independent of each other, whatever happens within a track, and their scatter says how large the errors really are:
+that is drawn otherwise than its warp supposes errs the same way for seconds. The scores `u_l = G_l^T r_l` of whole
+landmarks (G: how its observations pull at the shared parameters, everything else adjusting to it) are independent of
+each other, whatever happens within a track, and their scatter says how large the errors really are:
 
     sum_l u_l u_l^T   against   sum_l G_l^T (I - H_l) G_l,   H_l the hat matrix of the landmark's own position,
 
@@ -70,10 +70,9 @@ def _pulls(starts, at, by_frame, Jf, Jl, Je, extras, residuals):  # type: ignore
     the landmarks' own positions, as rows (3 l, k) of a root."""
     k, count = by_frame.shape[2], len(starts) - 1
     G, scores, taken = np.zeros((2 * len(at), k)), np.zeros((count, k)), np.zeros((3 * count, k))
-    block, pull = np.empty((3, 3)), np.empty(3)
+    block = np.empty((3, 3))
     for landmark in range(count):
         block[:] = 0.0
-        pull[:] = 0.0
         cross = taken[3 * landmark : 3 * landmark + 3]
         for m in range(starts[landmark], starts[landmark + 1]):
             for r in range(2):
@@ -89,22 +88,17 @@ def _pulls(starts, at, by_frame, Jf, Jl, Je, extras, residuals):  # type: ignore
                     scores[landmark, c] += residuals[m, r] * row[c]
                 for i in range(3):
                     x = Jl[m, r, i]
-                    pull[i] += x * residuals[m, r]
                     for j in range(3):
                         block[i, j] += x * Jl[m, r, j]
                     for c in range(k):
                         cross[i, c] += x * row[c]
-        _solve_root(block, cross, pull)
-        # nothing at the optimum; a landmark that is not there yet would pull as if its residuals scattered so
-        for i in range(3):
-            for c in range(k):
-                scores[landmark, c] -= cross[i, c] * pull[i]
+        _solve_root(block, cross)
     return G, scores, taken
 
 
 @njit(nogil=True)
-def _solve_root(block, cross, pull):  # type: ignore[no-untyped-def]
-    """`L^-1 cross` and `L^-1 pull` in place, L the Cholesky factor of the block with a ridge, left in its place."""
+def _solve_root(block, cross):  # type: ignore[no-untyped-def]
+    """`L^-1 cross` in place, L the Cholesky factor of the block with a ridge, which is left in its place."""
     ridge = _RIDGE * (block[0, 0] + block[1, 1] + block[2, 2]) + 1e-300
     for i in range(3):
         block[i, i] += ridge
@@ -117,10 +111,8 @@ def _solve_root(block, cross, pull):  # type: ignore[no-untyped-def]
         for q in range(i):
             for c in range(cross.shape[1]):
                 cross[i, c] -= block[i, q] * cross[q, c]
-            pull[i] -= block[i, q] * pull[q]
         for c in range(cross.shape[1]):
             cross[i, c] /= block[i, i]
-        pull[i] /= block[i, i]
 
 
 def _chunks(starts: Indices, size: int | None = None) -> list[tuple[int, int]]:
