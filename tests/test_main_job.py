@@ -283,9 +283,9 @@ class TestHeldOut:
             return _reduced(replace(adjusted.solution, problem=assembled.problem), assembled, kept)
 
         monkeypatch.setattr(association_rounds, "adjust", pass_on)
-        monkeypatch.setattr(association_rounds, "propose_searches", lambda now, *_: now)
+        monkeypatch.setattr(association_rounds, "propose_searches", lambda *_: None)
 
-        def all_found(_names: object, now: RigProblem, *_: object) -> Observations:
+        def all_found(now: RigProblem, *_: object) -> Observations:
             first = len(exact.landmarks) - len(now.landmarks)  # how many went
             rows = found.landmark_indices >= first
             return replace(found, landmark_indices=found.landmark_indices - first).take(rows)
