@@ -263,11 +263,12 @@ def _receiver(
     level = imu is not None and bool(usable)
     if imu is not None and not usable:
         return gnss, []
-    lasting = {n: len(longest_segment(trajectories[n])) for n in usable}
-    long_enough = [n for n in usable if 2 * lasting[n] >= max(lasting.values())]
+    segments = {n: longest_segment(trajectories[n]) for n in usable}
+    longest = max(len(segment) for segment in segments.values())
+    long_enough = [n for n in usable if 2 * len(segments[n]) >= longest]
     misfit = {n: float(np.square(fits[n].residuals).mean()) for n in long_enough if n in fits}
-    reference_camera = min(long_enough, key=lambda n: (misfit.get(n, 0.0), -lasting[n]))
-    segment = longest_segment(trajectories[reference_camera])
+    reference_camera = min(long_enough, key=lambda n: (misfit.get(n, 0.0), -len(segments[n])))
+    segment = segments[reference_camera]
     force = forces[reference_camera].given if level else None
     sure = force is not None and force.scale_std < 0.05 and force.scale > 0
     vetted = vet_receiver(
