@@ -23,6 +23,7 @@ from rigwake.cli.options import (
     FovOption,
     HorizonOption,
     JsonOption,
+    RepairOption,
     TopicOption,
     TopicsOption,
     fields_of_view,
@@ -36,6 +37,7 @@ from rigwake.pipeline.out_folder import check_out_folder
 
 if TYPE_CHECKING:
     from rigwake.calibration import Calibration
+    from rigwake.config import Config
     from rigwake.pipeline.calibration_run import CalibrationRun
 
 _OPEN = "undetermined"
@@ -73,10 +75,7 @@ def command(
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace the result that the folder holds.")] = False,
     allow_partial: AllowPartialOption = False,
-    repair: Annotated[
-        bool,
-        typer.Option("--repair/--no-repair", help="Correct units, leave out samples that cannot be right."),
-    ] = True,
+    repair: RepairOption = True,
     horizon: HorizonOption = "auto",
     intrinsics: Annotated[
         str | None,
@@ -121,9 +120,7 @@ def command(
         require_writable("--json", json_file)
         require_scheduler(scheduler)
         check_out_folder(out_folder, [recording], force=force, resume=resume)
-    from rigwake.calibration.yaml_file import calibration_to_dict
     from rigwake.config import load_config
-    from rigwake.pipeline.calibration_run import calibrate
     from rigwake.pipeline.prior import load_prior
     from rigwake.readers.topics import TopicMap
 
@@ -145,35 +142,22 @@ def command(
         repair=None if repair else False,
     )
     if print_config:
-        import yaml
-
-        out.print(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False), end="")
+        _print_settings(settings)
         return
     if recording is None:
         raise UsageError("No recording was given.", remedy="rigwake calibrate RECORDING -o OUT")
-    known = None if prior is None else load_prior(prior)
-    with progress_bars() as bars:
-        run = calibrate(
-            recording.absolute() if scheduler else recording,  # the same place on every machine
-            out_folder.absolute() if scheduler else out_folder,
-            settings,
-            topics=TopicMap.from_options(topic or (), topics, camera_file or ()),
-            trajectories=trajectories,
-            prior=known,
-            resume=resume,
-            force=force,
-            progress=bars,
-            **_on_cluster(scheduler),
-        )
-    if json_file is not None:
-        write_json(json_file, calibration_to_dict(run.calibration))
-    if str(json_file) != "-":
-        _print_run(run)
-    if view:
-        from rigwake.report.content import load_report_content
-        from rigwake.report.rerun_log import log_to_rerun
-
-        log_to_rerun(load_report_content(run.out), None, view)
+    run = _calibrated(
+        recording,
+        out_folder,
+        settings,
+        scheduler,
+        topics=TopicMap.from_options(topic or (), topics, camera_file or ()),
+        trajectories=trajectories,
+        prior=None if prior is None else load_prior(prior),
+        resume=resume,
+        force=force,
+    )
+    _show(run, json_file, view)
     if run.is_partial and not allow_partial:
         raise PartialResultError(
             f"{_headline(run)}.",
@@ -182,12 +166,40 @@ def command(
         )
 
 
-def _on_cluster(scheduler: str) -> dict[str, Any]:
-    if not scheduler:
-        return {}
-    from rigwake.fleet.dask_run import cameras_on_cluster
+def _print_settings(settings: Config) -> None:
+    import yaml
 
-    return {"run_cameras": cameras_on_cluster(scheduler)}
+    out.print(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False), end="")
+
+
+def _calibrated(
+    recording: Path, out_folder: Path, settings: Config, scheduler: str, **chosen: Any
+) -> CalibrationRun:
+    """The main job with progress, its camera stage on a Dask cluster if one is named."""
+    from rigwake.pipeline.calibration_run import calibrate
+
+    if scheduler:
+        from rigwake.fleet.dask_run import cameras_on_cluster
+
+        chosen["run_cameras"] = cameras_on_cluster(scheduler)
+        recording, out_folder = recording.absolute(), out_folder.absolute()  # the same place on every machine
+    with progress_bars() as bars:
+        return calibrate(recording, out_folder, settings, progress=bars, **chosen)
+
+
+def _show(run: CalibrationRun, json_file: Path | None, view: bool) -> None:
+    """The result as JSON, in the terminal and in the viewer, as was asked for."""
+    if json_file is not None:
+        from rigwake.calibration.yaml_file import calibration_to_dict
+
+        write_json(json_file, calibration_to_dict(run.calibration))
+    if str(json_file) != "-":
+        _print_run(run)
+    if view:
+        from rigwake.report.content import load_report_content
+        from rigwake.report.rerun_log import log_to_rerun
+
+        log_to_rerun(load_report_content(run.out), None, view)
 
 
 def _print_run(run: CalibrationRun) -> None:

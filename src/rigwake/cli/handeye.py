@@ -17,6 +17,7 @@ from rigwake.errors import UnobservableError
 if TYPE_CHECKING:
     from rigwake.calibration import CalibratedCamera
     from rigwake.handeye.handeye_problem import HandeyeResult
+    from rigwake.plausibility.values import SensorCheck
     from rigwake.trajectory import Trajectory
 
 _METHODS = ("ml", "thesis")
@@ -112,25 +113,30 @@ def command(
         from rigwake.report.handeye_page import handeye_page
 
         write_text_atomic(html, handeye_page(result, trajectories[0], trajectories[1:], checks))
-    if str(json_file) != "-":
+    quiet = str(json_file) == "-"
+    if not quiet:
         _print(result)
     if not any(camera.has_figures for camera in result.members.values()):
         raise _nothing_determined(result)
-    if str(json_file) == "-":
-        return
+    if not quiet:
+        _print_checks(checks)
+        options_given = _words_of_options(method, noise, time_offset, scale)
+        _name_next_step(output, [reference, *others, *options_given])
+
+
+def _print_checks(checks: Sequence[SensorCheck]) -> None:
     for check in checks:
         agreement = f"{100 * check.statistic:.1f} % of its motion does not agree"
-        out.print(
-            f"[dim]{escape(check.sensor)}: {agreement}. {escape(check.hypothesis)}[/dim]", soft_wrap=True
-        )
+        words = f"[dim]{escape(check.sensor)}: {agreement}. {escape(check.hypothesis)}[/dim]"
+        out.print(words, soft_wrap=True)
+
+
+def _name_next_step(output: Path | None, words: list[str]) -> None:
     if output is not None:
-        next_step(
-            ["rigwake", "export", output, "--to", "csv"], "a table; mountings without a lens fit json and csv"
-        )
+        why = "a table; mountings without a lens fit json and csv"
+        next_step(["rigwake", "export", output, "--to", "csv"], why)
     else:
-        options_given = _words_of_options(method, noise, time_offset, scale)
-        words = ["rigwake", "handeye", reference, *others, *options_given, "-o", "calibration.yaml"]
-        next_step(words, "keep the result")
+        next_step(["rigwake", "handeye", *words, "-o", "calibration.yaml"], "keep the result")
 
 
 def _words_of_options(method: str, noise: str, time_offset: bool, scale: bool) -> list[str]:

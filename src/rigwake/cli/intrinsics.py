@@ -132,31 +132,35 @@ def command(
         save_intrinsics(output, run.contents())
     if html is not None:
         write_text_atomic(html, run.page(images[0].resolve().name))
-    written = _plotted(run, plots)
+    written = [path for path in (output if run.found else None, html, *_plotted(run, plots)) if path]
     if json_file is not None:
         write_json(json_file, run.contents())
-    if str(json_file) != "-":
-        for camera_name, lens in run.found.items():
-            _print(camera_name, lens.result, lens.observations, lens.scores)
-        for path in [p for p in (output if run.found else None, html, *written) if p]:
-            out.print(f"written: {escape(str(path))}", soft_wrap=True)
+    quiet = str(json_file) == "-"
+    if not quiet:
+        _print_all(run, written)
     _refuse_missing(run.failed, len(run.found))
-    if str(json_file) == "-":
-        return
-    if output is None:
+    if not quiet:
         words = _words_again(images, board, image_size, fov, fix, free)
         words += ["--camera", camera, *topic_words(topic, topics)] if camera is not None else []
-        models = {lens.result.camera.model for lens in run.found.values()}
-        file = "lenses.yaml" if camera is not None else f"{next(iter(run.found))}.yaml"
-        next_step(
-            [*words, "--model", models.pop() if len(models) == 1 else "auto", "-o", file],
-            "write it to a file",
-        )
-    else:
-        next_step(
-            ["rigwake", "calibrate", "--help"],
-            f"then: calibrate RECORDING --camera-file {escape(str(output))} -o OUT",
-        )
+        _name_next_step(run, output, words, "lenses" if camera is not None else next(iter(run.found)))
+
+
+def _print_all(run: IntrinsicsRun, written: Sequence[Path]) -> None:
+    for name, lens in run.found.items():
+        _print(name, lens.result, lens.observations, lens.scores)
+    for path in written:
+        out.print(f"written: {escape(str(path))}", soft_wrap=True)
+
+
+def _name_next_step(run: IntrinsicsRun, output: Path | None, words: list[object], stem: str) -> None:
+    """words: the command again; stem: of the file to write, where none was given."""
+    if output is not None:
+        why = f"then: calibrate RECORDING --camera-file {escape(str(output))} -o OUT"
+        next_step(["rigwake", "calibrate", "--help"], why)
+        return
+    models = {lens.result.camera.model for lens in run.found.values()}
+    model = models.pop() if len(models) == 1 else "auto"
+    next_step([*words, "--model", model, "-o", f"{stem}.yaml"], "write it to a file")
 
 
 def _plotted(run: IntrinsicsRun, folder: Path | None) -> list[Path]:

@@ -15,6 +15,7 @@ from rigwake.cli.options import (
     CameraFileOption,
     HorizonOption,
     JsonOption,
+    RepairOption,
     TopicOption,
     TopicsOption,
     completed_from,
@@ -29,6 +30,7 @@ from rigwake.pipeline.out_folder import check_out_folder
 
 if TYPE_CHECKING:
     from rigwake.odometry.camera_odometry import CameraOdometry, CameraOdometryOptions
+    from rigwake.pipeline.odometry_run import OdometryRun
     from rigwake.plausibility.values import SensorCheck
     from rigwake.recording import Recording
 
@@ -97,10 +99,7 @@ def command(
     topic: TopicOption = None,
     topics: TopicsOption = None,
     camera_file: CameraFileOption = None,
-    repair: Annotated[
-        bool,
-        typer.Option("--repair/--no-repair", help="Correct units, leave out samples that cannot be right."),
-    ] = True,
+    repair: RepairOption = True,
     json_file: JsonOption = None,
 ) -> None:
     """Where a camera was, frame by frame: metric with an IMU or GNSS, up to scale without, and says so.
@@ -154,13 +153,17 @@ def command(
     if json_file is not None:
         summary = odometry_summary(opened, run.results)
         write_json(json_file, summary | {"sensor_checks": checks_to_list(run.checks)})
-    quiet = str(json_file) == "-"
-    if not quiet:
+    if str(json_file) != "-":
         _print(run.results)
+        if run.done:
+            _name_next_step(recording, run.done, output, topic_words(topic, topics))
+    _refuse(run, output, allow_partial)
+
+
+def _refuse(run: OdometryRun, output: Path, allow_partial: bool) -> None:
+    """The error that this run ends with: no trajectory, sensors that contradict each other, a missing camera."""
     if not run.done:
         raise next(iter(run.missing.values()))
-    if not quiet:
-        _name_next_step(recording, run.done, output, topic_words(topic, topics))
     for check in run.lens_checks:
         err.print(f"[yellow]{escape(check.sentence)}[/yellow]", soft_wrap=True)
     run.refuse_contradicted()

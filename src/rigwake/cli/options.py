@@ -70,6 +70,10 @@ FovOption = Annotated[
     ),
 ]
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Write the result as JSON ('-': print).")]
+RepairOption = Annotated[
+    bool,
+    typer.Option("--repair/--no-repair", help="Correct units, leave out samples that cannot be right."),
+]
 AllowPartialOption = Annotated[
     bool,
     typer.Option("--allow-partial", help="Exit with 0, not 4, though a camera is missing from the result."),

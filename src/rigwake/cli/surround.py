@@ -117,14 +117,13 @@ def command(
     projection = _projection(view, size, radius_m, yaw, fov)
     outline = _two_numbers(vessel, "--vessel") if vessel else None
     topic_map = TopicMap.from_options(topic or (), topics, camera_file or ())
+    shown_port = _PORT if port is None else port
     if live:
         require_extra("av", "video", "Showing live sources")
         from rigwake.views.live import serve_live
 
-        shown_port = _PORT if port is None else port
-        serve_live(
-            calibration, live, options, host, shown_port, Decoration(bumper_m, outline, hull == "mask")
-        )
+        decoration = Decoration(bumper_m, outline, hull == "mask")
+        serve_live(calibration, live, options, host, shown_port, decoration)
         return
     assert recording is not None
     with progress_bar() as bar:
@@ -137,21 +136,20 @@ def command(
             lambda words: bar.update(task, description=words, completed=next(steps)),
         )
     decoration = Decoration(bumper_m, outline, hull == "mask", setup.wave_std_m, setup.calibration)
-    if str(json_file) != "-":
-        for line in (setup.leveller.words, *setup.notes):
-            out.print(line, markup=False, highlight=False, soft_wrap=True)
+    quiet = str(json_file) == "-"
+    for line in () if quiet else (setup.leveller.words, *setup.notes):
+        out.print(line, markup=False, highlight=False, soft_wrap=True)
     if serve:
         from rigwake.views.serve.server import serve_recording
 
-        serve_recording(setup, decoration, host, _PORT if port is None else port)
+        serve_recording(setup, decoration, host, shown_port)
         return
     assert output is not None
     _write(setup, projection, decoration, output, at, radius_m)
     _report(setup, output, json_file, recording.name)
-    if str(json_file) != "-":
-        next_step(
-            ["rigwake", "surround", calibration, recording, "--serve"], "look around, live in the browser"
-        )
+    if not quiet:
+        words = ["rigwake", "surround", calibration, recording, "--serve"]
+        next_step(words, "look around, live in the browser")
 
 
 def _check_use(
