@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 
 import typer
-from typer._completion_classes import completion_init
+from typer.completion import get_completion_inspect_parameters
 
 from rigwake import __version__
 from rigwake.cli.console import adapt_streams, err, print_error
@@ -159,7 +159,7 @@ def _run(words: list[str]) -> int:
             is_option = bool(typed) and typed[0].startswith("-")
             app = build_app(outline=True, options=is_option or not is_completing)
         if is_completing:
-            completion_init()  # the shells' own forms, which typer otherwise loads with the options
+            get_completion_inspect_parameters()  # brings the shells' forms, else brought by options
         app(words, prog_name="rigwake")
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else int(bool(ended.code))
