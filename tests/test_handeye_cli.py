@@ -120,7 +120,7 @@ def test_what_determines_nothing_ends_with_exit_code_3(tmp_path, run, monkeypatc
     assert replace(one_axis, unobservable=one_axis.unobservable[2:]).has_figures
     there, empty = {"port": SE3.identity()}, {"port": np.empty((0, 2))}
     nothing = HandeyeResult(
-        "rig", {"port": one_axis}, there, np.eye(6), empty, "increments", {}, 5, 0, 3, converged=True
+        "rig", {"port": one_axis}, there, np.eye(6), empty, "increments", 5, 0, 3, converged=True
     )
     monkeypatch.setattr("rigwake.pipeline.handeye_run.calibrate_handeye", lambda *_: nothing)
     rig = write_tum(tmp_path / "rig.tum", wavy(TIMES))

@@ -72,7 +72,7 @@ class HandeyeResult:
     ref_from_members: the raw estimates by name; along unobservable directions they are arbitrary.
     joint_covariance: (6 M, 6 M) right tangents of the members in order.
     scales: by name, one (scale, std) per segment that was scaled; NaN where unobservable.
-    noise: what the likelihood assumed, in words. residual_std: by name, (6,) `[rotation, translation]`.
+    noise: what the likelihood assumed, in words.
     steps, down_weighted: how many steps in time entered, and how many of them as outliers.
     """
 
@@ -82,7 +82,6 @@ class HandeyeResult:
     joint_covariance: Array
     scales: Mapping[str, Array]
     noise: str
-    residual_std: Mapping[str, Array]
     steps: int
     down_weighted: int
     iterations: int

@@ -180,7 +180,7 @@ def _result(
     total = covariance(problem, estimate)
     reference = problem.reference.trajectory
     rotations = problem.reference.increments[:, :3]
-    members, raw, scales, spread = {}, {}, {}, {}
+    members, raw, scales = {}, {}, {}
     columns = [at.start + i for at in problem.columns for i in range(6)]
     for m, (curve, layout, at) in enumerate(
         zip(problem.members, problem.layouts, problem.columns, strict=True)
@@ -188,7 +188,6 @@ def _result(
         name, mounting = curve.trajectory.name, estimate.mountings[m]
         block = total[at, at]
         valid = estimate.valid[:, m]
-        spread[name] = estimate.residuals[m][valid].std(axis=0)
         stds = np.sqrt(np.diag(block)[layout.scales])
         known = np.where(stds < USEFUL_LOG_SCALE, 1.0, np.nan)
         values = np.exp(mounting.log_scales[: layout.scale_count])
@@ -215,7 +214,6 @@ def _result(
         total[np.ix_(columns, columns)],
         scales,
         _noise_words(problem),
-        spread,
         int(estimate.equations.used.sum()),
         int(np.sum(estimate.equations.weights < 1)),
         estimate.iterations,
@@ -260,7 +258,6 @@ def _thesis_result(problem: HandeyeProblem, start: Sequence[Mounting]) -> Handey
         np.full((6 * len(raw), 6 * len(raw)), np.nan),
         {name: np.zeros((0, 2)) for name in raw},
         "ignored",
-        {name: np.full(6, np.nan) for name in raw},
         len(reference.segments),
         0,
         1,

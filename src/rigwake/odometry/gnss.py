@@ -33,7 +33,6 @@ class GnssAlignment:
     enu_from_visual: with scale (metres per visual unit). antenna_cam: (3,) antenna in the camera's frame, metres.
     covariance: (10, 10) of `[rotation of enu (left), log scale, translation, antenna_cam]`.
     used: (G,) fixes that took part; gated: how many of those in its time were refused by the chi-square gate.
-    rms_m: of the used fixes.
     """
 
     enu_from_visual: Alignment
@@ -41,7 +40,6 @@ class GnssAlignment:
     covariance: Array
     used: NDArray[np.bool_]
     gated: int
-    rms_m: float
 
 
 def align_gnss(
@@ -92,13 +90,11 @@ def align_gnss(
         if np.abs(step).max() < 1e-7 and iteration > 1:
             break
     covariance = np.asarray(np.linalg.pinv(information, hermitian=True))
-    error, _ = x.linearise(centres, rotations, fixes)
-    rms = float(np.sqrt(np.mean((error[used] ** 2).sum(axis=1))))
     if used.sum() < _MIN_FIXES or not np.sqrt(covariance[3, 3]) < 0.2 or x.alignment.scale <= 0:
         raise _unobservable(trajectory.name)
     taking_part = np.zeros(len(gnss.timestamps_ns), dtype=bool)
     taking_part[index[used]] = True
-    return GnssAlignment(x.alignment, x.antenna_cam, covariance, taking_part, int((~used).sum()), rms)
+    return GnssAlignment(x.alignment, x.antenna_cam, covariance, taking_part, int((~used).sum()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,14 +54,12 @@ class GyroAlignment:
 
     imu_from_cam: (3, 3). time_offset_s: `t_imu = t_cam + time_offset_s`. gyro_bias: (3,) rad/s, IMU axes.
     covariance: (7, 7) of `[rotation about IMU axes, gyro bias, time offset]`, scaled by the residuals.
-    rms_deg: of one camera motion against the gyro's.
     """
 
     imu_from_cam: Array
     time_offset_s: float
     gyro_bias: Array
     covariance: Array
-    rms_deg: float
 
 
 def align_gyro(
@@ -109,7 +107,7 @@ def align_gyro(
             break
     covariance = np.asarray(np.linalg.pinv(information, hermitian=True)) * rms**2
     _require_rotation(information, rms, trajectory.name)
-    return GyroAlignment(X, offset_s, bias, covariance, float(np.rad2deg(rms)))
+    return GyroAlignment(X, offset_s, bias, covariance)
 
 
 def _camera_rotations(

@@ -20,7 +20,6 @@ from rigwake.trajectory import Trajectory
 
 _FEW = 3  # segments that are worth a line each
 _UP = np.array([0.0, 0.0, 1.0])
-_ALIGNED_STD = np.deg2rad(1.0)  # floor of what is assumed for a first value
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +28,7 @@ class MetricStart:
 
     world_from_cam: metric, camera clock. world: `enu` (GNSS), or `level` (IMU alone: z up, heading arbitrary).
     scale_source: which sensor gave metres. rig_from_cam: rig axes and origin are the IMU's; identity without one.
-    rig_from_cam_std: (6,) about and along rig axes. time_offset_s: `t_rig = t_cam + time_offset_s`.
+    time_offset_s: `t_rig = t_cam + time_offset_s`.
     gyro_bias, accel_bias: (3,) rig axes. antenna_rig, antenna_std: (3,) or None without GNSS.
     gnss_used: (G,) fixes that passed the chi-square gate, None without GNSS. notes: what was left out or bridged.
     """
@@ -38,7 +37,6 @@ class MetricStart:
     world: Literal["enu", "level"]
     scale_source: Literal["gnss", "imu"]
     rig_from_cam: SE3
-    rig_from_cam_std: Array
     time_offset_s: float
     gyro_bias: Array
     accel_bias: Array
@@ -102,7 +100,6 @@ def metric_start(
         "enu" if by_gnss is not None else "level",
         "gnss" if by_gnss is not None else "imu",
         rig.rig_from_cam,
-        rig.std,
         offset_s,
         gyro.gyro_bias if gyro is not None else np.zeros(3),
         inertial.accel_bias if inertial is not None else np.zeros(3),
@@ -218,7 +215,6 @@ def _joined(pieces: list[Trajectory]) -> Trajectory:
 @dataclass(frozen=True, eq=False)
 class _Rig:
     rig_from_cam: SE3 = field(default_factory=SE3.identity)
-    std: Array = field(default_factory=lambda: np.zeros(6))
     antenna: Array | None = None
     antenna_std: Array | None = None
 
@@ -235,9 +231,7 @@ def _rig(
     R = gyro.imu_from_cam
     rig_from_cam = SE3(R, -R @ inertial.imu_cam)
     lever_std = np.sqrt(np.diag(R @ inertial.covariance[4:7, 4:7] @ R.T))
-    rotation_std = np.maximum(np.sqrt(np.diag(gyro.covariance)[:3]), 0.1 * _ALIGNED_STD)
-    std = np.concatenate([rotation_std, np.maximum(lever_std, 0.01)])
     if by_gnss is None or antenna_cov is None:
-        return _Rig(rig_from_cam, std)
+        return _Rig(rig_from_cam)
     antenna_std = np.sqrt(np.diag(R @ antenna_cov @ R.T) + lever_std**2)
-    return _Rig(rig_from_cam, std, rig_from_cam * by_gnss.antenna_cam, antenna_std)
+    return _Rig(rig_from_cam, rig_from_cam * by_gnss.antenna_cam, antenna_std)

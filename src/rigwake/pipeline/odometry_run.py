@@ -247,6 +247,7 @@ def camera_summary(result: CameraOdometry | RigwakeError) -> dict[str, Any]:
             "reason": report.reason,
             "noise_factor": result.smoothed.noise_factor,
             "frames_bridged": result.smoothed.bridged,
+            "gnss_refused": result.smoothed.gnss_gated,
             "time_offset_s": result.smoothed.time_offset_s,
         }
     return summary

@@ -50,7 +50,6 @@ class _FolderStreams:
     root: Path
     models: Mapping[str, CameraModel] = field(default_factory=dict)
     rig: Rig | None = None
-    imu_settings: object = None
     cameras: dict[str, CameraStream] = field(default_factory=dict)
     imus: dict[str, ImuStream] = field(default_factory=dict)
     gnss: dict[str, GnssStream] = field(default_factory=dict)

@@ -128,8 +128,8 @@ def solve(problem: RigProblem, options: SolverOptions | None = None) -> RigSolut
 def _minimise(problem: RigProblem, options: SolverOptions) -> RigSolution:
     structure = structure_of(problem)
     linear = linearised(problem, structure, options)
-    initial, damping, growth = linear.cost, options.initial_damping, 2.0
-    if not np.isfinite(initial):
+    damping, growth = options.initial_damping, 2.0
+    if not np.isfinite(linear.cost):
         raise EstimationError(
             "The cost of the bundle adjustment is not finite at its initial values.",
             remedy="Check the initial poses, landmarks and the measurements' covariances.",
@@ -160,7 +160,6 @@ def _minimise(problem: RigProblem, options: SolverOptions) -> RigSolution:
         converged,
         reason,
         iteration,
-        initial,
         linear.cost,
         len(problem.observations),
         linear.reprojection.beyond,

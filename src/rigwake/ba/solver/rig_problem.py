@@ -364,7 +364,6 @@ class SolverReport:
     converged: bool
     reason: str
     iterations: int
-    initial_cost: float
     final_cost: float
     observations: int
     beyond_lens: int
