@@ -17,7 +17,6 @@ from rigwake.cameras.protocol import CameraModel
 from rigwake.geometry.se3 import SE3
 from rigwake.simulation import shading
 from rigwake.simulation.hull_mesh import Hull, Tube
-from rigwake.simulation.imaging import decode
 from rigwake.simulation.meshes import join, rectangle
 from rigwake.simulation.record import Shot
 from rigwake.simulation.render import Renderer
@@ -163,7 +162,9 @@ def motion_agreement(shot: Shot, truth_shot: Shot, first: int, second: int) -> M
     seas = [renderer.water(float(times[i])) for i in (first, second)]
     pictures = []
     for index, sea in zip((first, second), seas, strict=True):
-        picture = decode(np.frombuffer(shot.take(index, float(times[index]), sea), np.uint8), colour=False)
+        picture = cv2.imdecode(
+            np.frombuffer(shot.take(index, float(times[index]), sea), np.uint8), cv2.IMREAD_GRAYSCALE
+        )
         assert picture is not None
         pictures.append(picture)
     seen = renderer.truth(truth_shot.view, shot.row_poses(float(times[first])), seas[0])

@@ -21,8 +21,8 @@ from cli_runs import run
 from rigwake.calibration import load_calibration, save_calibration
 from rigwake.config import load_config
 from rigwake.errors import UsageError
-from rigwake.fleet.drift_history import drift_points
-from rigwake.fleet.fleet_jobs import FleetJob
+from rigwake.fleet.drift_history import DriftHistory, DriftPoint
+from rigwake.fleet.fleet_jobs import FleetJob, FleetOutcome
 from rigwake.fleet.recording_list import list_recordings
 from rigwake.fleet.resume import read_outcome
 from rigwake.fleet.run_one import check_machine, run_one
@@ -58,6 +58,13 @@ def boats(tmp_path_factory: pytest.TempPathFactory) -> Boats:
     )
     ended = run("fleet", "calibrate", folder / "list.txt", "-o", folder / "out", "--jobs", 2)
     return Boats(folder, folder / "out", ended.words, ended.code)
+
+
+def drift_points(outcomes: list[FleetOutcome]) -> list[DriftPoint]:
+    history = DriftHistory()
+    for outcome in outcomes:
+        history.add(outcome)
+    return history.points()
 
 
 def hashes(out: Path) -> dict[str, str]:

@@ -89,14 +89,6 @@ class DriftHistory:
         return sorted(points, key=lambda p: (p.started_ns, p.recording, p.camera))
 
 
-def drift_points(outcomes: Iterable[FleetOutcome]) -> list[DriftPoint]:
-    """See `DriftHistory.points`, of the outcomes of one vessel."""
-    history = DriftHistory()
-    for outcome in outcomes:
-        history.add(outcome)
-    return history.points()
-
-
 def _turned_from_median(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     """Degrees of every rotation from the one in the middle, judged by at most some hundred others."""
     sample = rotations[:: max(len(rotations) // _SAMPLE, 1)]

@@ -24,7 +24,6 @@ from rigwake.recording import Finding, GnssStream
 from rigwake.trajectory import Trajectory
 
 FIX = "sensor_msgs/msg/NavSatFix"
-STANDARD_GRAVITY = 9.80665
 _NO_FIX = -1
 
 Findings = tuple[Finding, ...]

@@ -6,7 +6,6 @@ import math
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rigwake._types import Floats, Image
 from rigwake.cameras.protocol import CameraModel
@@ -92,9 +91,3 @@ def encode(picture: Image, quality: int, colour: bool) -> bytes:
             "OpenCV could not encode a picture as JPEG.", remedy="Check the installation of OpenCV."
         )
     return bytes(buffer)
-
-
-def decode(encoded: NDArray[np.uint8], colour: bool) -> Image | None:
-    """The picture in JPEG bytes, BGR or grey; None if they are broken."""
-    picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE)
-    return None if picture is None else np.asarray(picture, np.uint8)
