@@ -37,7 +37,7 @@ from rigwake.pipeline.out_folder import check_out_folder
 
 if TYPE_CHECKING:
     from rigwake.calibration import Calibration
-    from rigwake.config import Config
+    from rigwake.config import CalibrateConfig
     from rigwake.pipeline.calibration_run import CalibrationRun
 
 _OPEN = "undetermined"
@@ -166,14 +166,14 @@ def command(
         )
 
 
-def _print_settings(settings: Config) -> None:
+def _print_settings(settings: CalibrateConfig) -> None:
     import yaml
 
     out.print(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False), end="")
 
 
 def _calibrated(
-    recording: Path, out_folder: Path, settings: Config, scheduler: str, **chosen: Any
+    recording: Path, out_folder: Path, settings: CalibrateConfig, scheduler: str, **chosen: Any
 ) -> CalibrationRun:
     """The main job with progress, its camera stage on a Dask cluster if one is named."""
     from rigwake.pipeline.calibration_run import calibrate

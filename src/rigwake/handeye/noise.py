@@ -13,7 +13,7 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from rigwake._types import Array
 from rigwake.geometry.se3 import SE3
@@ -27,7 +27,7 @@ OUTLIER_PROBABILITY = 1e-3
 _UNIT = np.eye(3)
 _ENOUGH_COMMON = 30  # steps of two members, to tell what they share
 _Pairs = list[tuple[int, int, NDArray[np.bool_]]]
-_CHI2_MEDIAN, _CHI2_LIMIT = float(chi2.ppf(0.5, 3)), float(chi2.ppf(1 - OUTLIER_PROBABILITY, 3))
+_CHI2_MEDIAN, _CHI2_LIMIT = float(chdtri(3, 0.5)), float(chdtri(3, OUTLIER_PROBABILITY))
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ def robust_mean_square(rows: Array, known: NDArray[np.bool_], first: int) -> flo
 @cache
 def outlier_limit(dimension: int) -> float:
     """Squared length that one in a thousand Gaussian vectors exceeds: Huber weights fall off from there."""
-    return float(chi2.ppf(1 - OUTLIER_PROBABILITY, dimension))
+    return float(chdtri(dimension, OUTLIER_PROBABILITY))
 
 
 @dataclass(frozen=True)

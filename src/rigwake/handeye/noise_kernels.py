@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from rigwake._kernels import njit
 from rigwake._types import Array
@@ -214,8 +214,8 @@ _SCORINGS = 12  # steps towards the level of one share
 _ROUNDS = 3  # of weights and levels
 _LEAST = 1e-4  # level of translation, of all that moves
 TRANSLATION_FLOOR = 1e-9  # m; nothing is known better than rounding allows
-_MEDIAN = float(chi2.ppf(0.5, 3))
-_LIMIT = float(chi2.ppf(0.999, 6))
+_MEDIAN = float(chdtri(3, 0.5))
+_LIMIT = float(chdtri(6, 0.001))
 _FAR = 3.0  # times the limit (in deviations) from where on an outlier counts no more than one at it
 _GOLDEN = (math.sqrt(5.0) - 1) / 2
 

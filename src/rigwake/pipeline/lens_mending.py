@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from rigwake._types import Array
 from rigwake.ba.rig.intrinsics_refinement import (
@@ -175,7 +175,7 @@ def _contradicts(believed: CameraModel, found: CameraModel, pixels: Array) -> bo
     """Whether a lens is too far from the one believed for its prior to have been right."""
     prior = intrinsics_prior(believed, pixels)
     moved = found.params - prior.mean
-    return bool(moved @ prior.information @ moved > chi2.isf(_UNLIKELY, len(moved)))
+    return bool(moved @ prior.information @ moved > chdtri(len(moved), _UNLIKELY))
 
 
 def _rms_px(before: CameraModel, after: CameraModel, pixels: Array) -> float:
