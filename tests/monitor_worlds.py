@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -59,3 +60,10 @@ def watch(
     assert rig.antenna_rig is not None
     motion = rig_motion(recording.imus["imu"], recording.gnss["gnss"], np.array(rig.antenna_rig))
     return Watch(recording, tracks, calibration_of(rig), motion)
+
+
+@cache
+def figure_eights() -> tuple[Watch, BlockScores]:
+    """A lively watch of 100 s without a change, and its scores: of use to all that only look at them."""
+    world = watch("eights", 100.0, seed=7)
+    return world, world.scores()

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from monitor_worlds import Watch, watch
+from monitor_worlds import Watch, figure_eights, watch
 from rigwake.errors import UsageError
 from rigwake.monitor.innovations import belief_of
 from rigwake.monitor.judge import Judgement
@@ -16,6 +16,7 @@ from rigwake.monitor.states import CameraState, Standing, next_standing, recalib
 from rigwake.monitor.thresholds import Thresholds
 from rigwake.simulation.track_stream import MountFault
 
+pytestmark = pytest.mark.xdist_group("watch")
 AT_S = 43.0
 
 
@@ -26,12 +27,12 @@ def states_of(judgement: Judgement, camera: str) -> list[CameraState]:
 
 @pytest.fixture(scope="module")
 def quiet() -> Watch:
-    return watch("eights", 100.0, seed=7)
+    return figure_eights()[0]
 
 
 @pytest.fixture(scope="module")
-def quiet_scores(quiet: Watch) -> BlockScores:
-    return quiet.scores()
+def quiet_scores() -> BlockScores:
+    return figure_eights()[1]
 
 
 def shifted(scores: BlockScores, camera: str, from_block: int, step: np.ndarray) -> BlockScores:

@@ -5,21 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from monitor_worlds import Watch, watch
+from monitor_worlds import Watch, figure_eights, watch
 from rigwake.geometry import so3
 from rigwake.monitor.pair_kernels import COLUMNS, accumulate, pair_residuals
-from rigwake.monitor.score import BlockScores
 from rigwake.simulation.track_stream import MountFault
 
-
-@pytest.fixture(scope="module")
-def lively() -> Watch:
-    return watch("eights", 100.0)
-
-
-@pytest.fixture(scope="module")
-def lively_scores(lively: Watch) -> BlockScores:
-    return lively.scores()
+pytestmark = pytest.mark.xdist_group("watch")
 
 
 def test_derivatives_against_finite_differences() -> None:
@@ -74,9 +65,9 @@ def test_derivatives_against_finite_differences() -> None:
         np.testing.assert_allclose(rows[:, k], numeric, rtol=1e-4, atol=1e-4 * np.abs(numeric).max() + 1e-6)
 
 
-def test_steps_are_unbiased_and_covariances_honest(lively_scores: BlockScores) -> None:
+def test_steps_are_unbiased_and_covariances_honest() -> None:
     """Without a change: over blocks and cameras the whitened steps have mean zero and at most unit variance."""
-    scores = lively_scores
+    _, scores = figure_eights()
     whitened = []
     for k in range(1, len(scores)):
         for c in range(4):
@@ -109,7 +100,8 @@ def test_standstill_shows_nothing() -> None:
         assert np.rad2deg(std).max() > 1.0
 
 
-def test_a_camera_without_tracks_has_no_information(lively: Watch) -> None:
+def test_a_camera_without_tracks_has_no_information() -> None:
+    lively = watch("eights", 32.0, cameras=3)
     fog = lively.tracks["back"].take(np.zeros(len(lively.tracks["back"]), dtype=bool))
     half = Watch(lively.recording, {**lively.tracks, "back": fog}, lively.calibration, lively.motion)
     scores = half.scores()

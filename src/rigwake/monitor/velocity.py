@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_banded
 
 from rigwake._types import Array, Indices
 from rigwake.geometry import so3
@@ -149,10 +150,23 @@ def solve_velocities(
         H, g = H[:-3, :-3], g[:-3]  # the gyro's bias is known well enough here
         _add_blocks(H, H_slot)
         g[: 3 * count] -= g_slot.ravel()
-        step = np.linalg.solve(H, g)[: 3 * count].reshape(count, 3)
+        step = _solve_chain(H, g, 3 * count)[: 3 * count].reshape(count, 3)
         longest = 0.5 * max(float(np.linalg.norm(velocity, axis=1).mean()), 0.2)
         velocity = velocity + step * min(1.0, longest / max(float(np.linalg.norm(step, axis=1).max()), 1e-12))
     return velocity, np.einsum("nij,nj->ni", between.by_velocity, velocity[slots.slot]) + lever
+
+
+def _solve_chain(H: Array, g: Array, count: int) -> Array:
+    """`H^-1 g`, where only neighbouring slots share entries of the first `count` rows and columns of H."""
+    width = 5  # of the band on either side: 3 x 3 blocks and their neighbours
+    band = np.zeros((2 * width + 1, count))
+    for k in range(-width, width + 1):
+        band[width - k, max(k, 0) : count + min(k, 0)] = np.diagonal(H[:count, :count], k)
+    solved = solve_banded((width, width), band, np.column_stack([g[:count], H[:count, count:]]))
+    rest = np.linalg.solve(
+        H[count:, count:] - H[count:, :count] @ solved[:, 1:], g[count:] - H[count:, :count] @ solved[:, 0]
+    )
+    return np.concatenate([solved[:, 0] - solved[:, 1:] @ rest, rest])
 
 
 def _add_blocks(H: Array, blocks: Array) -> None:
