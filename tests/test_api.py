@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 
 import rigwake
-from calibrated_rigs import PINHOLE
 from cli_runs import write_examples
 from rigwake import api
 from rigwake.cameras.formats.camera_files import write_cameras
+from rigwake.cameras.registry import camera_from_params
 from rigwake.cli.main import VERBS
 from rigwake.errors import InputError, UnobservableError, UsageError
 from rigwake.geometry.se3 import SE3
 from rigwake.readers.trajectories import read_trajectory
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
+SMALL = camera_from_params("pinhole", [125.0, 125.2, 79.5, 60.7, 0, -0.2, 0.08, 0.001, 0.002, 0], 160, 120)
 
 # (script, arguments, words of the output)
 RUNS = [
@@ -37,9 +38,9 @@ RUNS = [
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("api")
     names = write_examples(folder)
-    write_cameras(folder / "lens.yaml", {"front": PINHOLE})
+    write_cameras(folder / "lens.yaml", {"front": SMALL})
     picture = folder / "picture.png"
-    cv2.imwrite(str(picture), np.full((PINHOLE.height_px, PINHOLE.width_px), 128, np.uint8))
+    cv2.imwrite(str(picture), np.full((SMALL.height_px, SMALL.width_px), 128, np.uint8))
     return names | {"lens": folder / "lens.yaml", "picture": picture}
 
 
