@@ -1,18 +1,26 @@
 """A receiver's white noise, lasting errors and delay: learnt within bounds, and never worse than no receiver."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
 from calibration_worlds import first_values, measurements, sail
 from rigwake.ba.rig.assemble_problem import assemble_problem
-from rigwake.ba.rig.gnss_noise import white_noise, with_learnt_receiver_errors, with_receiver_errors
+from rigwake.ba.rig.gnss_noise import (
+    _between_nodes,
+    _correlation_s,
+    _lasting,
+    white_noise,
+    with_learnt_receiver_errors,
+    with_receiver_errors,
+)
 from rigwake.ba.rig.outlier_rounds import adjust
 from rigwake.ba.rig.rig_values import AdjustmentOptions, RigMeasurements
 from rigwake.ba.rig.rig_verdicts import ReferenceFrame, calibrated_cameras
 from rigwake.ba.solver.covariance import covariance_of
-from rigwake.ba.solver.rig_problem import RigProblem
+from rigwake.ba.solver.rig_problem import LastingErrors, RigProblem
 from rigwake.geometry.se3 import SE3
 from rigwake.readers.truth_files import rig_in_frame
 from rigwake.recording import GnssStream
@@ -20,7 +28,12 @@ from rigwake.simulation.sensors import gauss_markov
 from rigwake.simulation.tracks_only import SimulatedTracks
 
 OPTIONS = AdjustmentOptions(tracks_per_second=20)
-WORLD = sail(features=40)
+STAMPS = np.arange(3000) * 200_000_000
+
+
+@cache
+def world() -> SimulatedTracks:
+    return sail(features=40)
 
 
 def lasting(gnss: GnssStream, seed: int, stated_m: float = 1.03) -> GnssStream:
@@ -32,8 +45,8 @@ def lasting(gnss: GnssStream, seed: int, stated_m: float = 1.03) -> GnssStream:
 
 
 def problem_with(gnss: GnssStream) -> RigProblem:
-    given = replace(measurements(WORLD), gnss=gnss)
-    return assemble_problem(given, first_values(WORLD, seed=1), OPTIONS).problem
+    given = replace(measurements(world()), gnss=gnss)
+    return assemble_problem(given, first_values(world(), seed=1), OPTIONS).problem
 
 
 def test_white_noise_is_told_from_motion() -> None:
@@ -46,7 +59,7 @@ def test_white_noise_is_told_from_motion() -> None:
 
 
 def test_a_precise_receiver_has_no_lasting_errors_and_a_coarse_one_has() -> None:
-    gnss = WORLD.recording.gnss["gnss"]
+    gnss = world().recording.gnss["gnss"]
     assert problem_with(gnss).antenna.errors is None
     errors = problem_with(lasting(gnss, 0)).antenna.errors
     assert errors is not None
@@ -55,9 +68,9 @@ def test_a_precise_receiver_has_no_lasting_errors_and_a_coarse_one_has() -> None
 
 
 def test_what_residuals_show_is_believed_over_what_is_stated_within_bounds() -> None:
-    gnss = WORLD.recording.gnss["gnss"]
+    gnss = world().recording.gnss["gnss"]
     problem = problem_with(gnss)
-    body = WORLD.recording.true_trajectories["rig"]
+    body = world().recording.true_trajectories["rig"]
     assert body.duration_s > 20
     coarse = replace(problem, gnss=replace(lasting(gnss, 0), covariances=gnss.covariances))
     learnt = with_learnt_receiver_errors(coarse)
@@ -66,6 +79,28 @@ def test_what_residuals_show_is_believed_over_what_is_stated_within_bounds() -> 
     assert 10.0 <= learnt.antenna.errors.correlation_s <= 300.0
     again = with_receiver_errors(replace(problem, imu=None, states=replace(problem.states, inertial=None)))
     assert again.antenna.errors is None
+
+
+def test_the_correlation_time_is_that_of_the_errors() -> None:
+    rng = np.random.default_rng(0)
+    off = gauss_markov(rng, len(STAMPS), 0.2, 1.0, 40.0) + rng.normal(0, 0.05, (len(STAMPS), 3))
+    found = _correlation_s(STAMPS, off, np.full(3, 0.05), np.ones(3), 20.0)
+    assert 40.0 < found < 90.0  # means over four seconds change less than the error itself
+    assert _correlation_s(STAMPS, off, np.full(3, 2.0), np.ones(3), 20.0) == 20.0  # all of it is white
+
+
+def test_a_precise_receiver_learns_no_lasting_errors() -> None:
+    white = np.random.default_rng(0).normal(0, 0.1, (len(STAMPS), 3))
+    assert _lasting(STAMPS, white, np.full(3, 0.1)).max() < 0.01
+
+
+def test_what_nodes_cannot_follow_is_shared_by_the_fixes_between() -> None:
+    nodes, step = STAMPS[::25], 25
+    process = gauss_markov(np.random.default_rng(0), len(STAMPS), 0.2, 1.0, 40.0)
+    line = np.stack([np.interp(STAMPS, nodes, process[::step, k]) for k in range(3)], axis=1)
+    missed = np.mean((process - line)[: nodes.size * step - step] ** 2)
+    counted = _between_nodes(LastingErrors(nodes, process[::step], np.ones(3), 40.0), STAMPS)
+    np.testing.assert_allclose(counted**2, missed / 2 * step, rtol=0.2)  # the best line misses half of it
 
 
 def adjusted_error(world: SimulatedTracks, given: RigMeasurements) -> tuple[float, float, float]:

@@ -227,6 +227,13 @@ def test_one_picture_per_stretch_tells_whether_there_is_anything_to_follow() -> 
     assert (texture[5:, 0] == 0).all()
 
 
+def test_stretches_without_frames_have_no_texture() -> None:
+    camera = CameraStream("front", np.arange(400) * 10**8, CountingFrames(800), 80, 60)
+    texture = texture_over_time({"front": camera}, stretch_spans(0, 80 * 10**9, 8.0))
+    assert (texture[:5, 0] > 0.5).all()
+    assert (texture[5:, 0] == 0).all()
+
+
 def test_frames_outside_of_the_sections_are_never_read() -> None:
     source = CountingFrames(800)
     camera = CameraStream("front", np.arange(800) * 10**8, source, 80, 60)
