@@ -81,6 +81,16 @@ def test_what_residuals_show_is_believed_over_what_is_stated_within_bounds() -> 
     assert again.antenna.errors is None
 
 
+def test_white_noise_beyond_what_is_stated_is_believed() -> None:
+    gnss = world().recording.gnss["gnss"]
+    noise = np.random.default_rng(0).normal(0, 0.25, gnss.position_enu.shape)
+    stated = np.tile(np.eye(3) * 0.02**2, (len(noise), 1, 1))
+    optimistic = replace(gnss, position_enu=gnss.position_enu + noise, covariances=stated)
+    learnt = with_learnt_receiver_errors(problem_with(optimistic)).gnss
+    assert learnt is not None
+    assert np.sqrt(learnt.covariances[:, [0, 1], [0, 1]]).min() > 0.2
+
+
 def test_the_correlation_time_is_that_of_the_errors() -> None:
     rng = np.random.default_rng(0)
     off = gauss_markov(rng, len(STAMPS), 0.2, 1.0, 40.0) + rng.normal(0, 0.05, (len(STAMPS), 3))

@@ -305,6 +305,16 @@ def test_fixes_that_stand_still_jump_or_lie_far_off_are_left_out() -> None:
         assert kept[~bad].mean() > 0.8, spoil
 
 
+def test_one_fix_far_off_leaves_the_others_their_weight() -> None:
+    path, offset_s, _ = level()
+    p = gnss().position_enu.copy()
+    clean = fit_receiver(path, gnss(), p, time_offset_s=offset_s)
+    p[len(p) // 2] += [60.0, -80.0, 0.0]
+    off = fit_receiver(path, gnss(), p, time_offset_s=offset_s)
+    assert abs(off.scale / clean.scale - 1) < 0.01
+    assert off.scale_std < 1.5 * clean.scale_std
+
+
 def test_a_coarse_converter_is_not_a_clipped_one() -> None:
     coarse = replace(imu(), gyro=np.round(imu().gyro, 2))
     assert not any("clipped" in check.hypothesis for check in vet_samples(coarse).checks)

@@ -154,6 +154,15 @@ def test_asked_precision_is_reached_with_few_stretches_or_it_is_said_that_it_can
     assert len(choice.stretches) >= 45
 
 
+def test_what_was_told_already_counts_less() -> None:
+    told = np.ones((30, 6))
+    told[10:20, :3] = 1e6  # 1 mrad each
+    told[20:, 3:] = 0.5e6  # 1.4 mm each
+    wanted = Precision(rotation=0.51e-3, translation=0.72e-3)
+    choice = choose_sections(made_up(told), np.ones(30), precision=wanted)
+    assert [(choice.stretches < 20).sum(), (choice.stretches >= 20).sum()] == [4, 4]
+
+
 def test_axes_that_nothing_tells_do_not_draw_in_the_whole_recording() -> None:
     told = np.full((40, 6), 1.0)
     told[[5, 6, 7]] = 1e7
