@@ -1,9 +1,12 @@
 """Simulated views of boards through wide lenses, as corners or as rendered images."""
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 
 from rigwake.cameras.protocol import CameraModel
+from rigwake.cameras.registry import camera_from_params
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3, stack
 from rigwake.intrinsics.board_observations import BoardObservations, BoardView
@@ -86,6 +89,21 @@ def _aprilgrid_texture(board: Board, x: np.ndarray, y: np.ndarray) -> np.ndarray
     return texture
 
 
+_texture = lru_cache(maxsize=2)(board_texture)  # many pictures are made of one board with one lens
+
+
+@lru_cache(maxsize=2)
+def _rays(
+    model: str, params: tuple[float, ...], size: tuple[int, int], limit: float | None, oversample: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rays (H, W, 3) of all parts of all pixels, and which the lens sees; they take longer than all the rest."""
+    offsets = (np.arange(oversample) + 0.5) / oversample - 0.5
+    columns, rows = ((np.arange(count)[:, None] + offsets).ravel() for count in size)
+    grid = np.stack(np.meshgrid(columns, rows), axis=-1)
+    rays, valid = camera_from_params(model, params, *size, limit).unproject(grid.reshape(-1, 2))
+    return np.nan_to_num(rays).reshape(*grid.shape[:2], 3), valid.reshape(grid.shape[:2])
+
+
 def render_board(
     camera: CameraModel,
     board: Board,
@@ -98,27 +116,53 @@ def render_board(
 
     blur_px: standard deviation of the lens's blur; without it, only the pixels' own area blurs.
     """
-    pixels_per_m = 2000.0
-    texture, rim = board_texture(board, pixels_per_m)
+    pixels_per_m, background = 2000.0, 90
+    texture, rim = _texture(board, pixels_per_m)
     extent = board.corner_points[:, :2].max(axis=0)
-    offsets = (np.arange(oversample) + 0.5) / oversample - 0.5
-    columns = (np.arange(camera.width_px)[:, None] + offsets).ravel()
-    rows = (np.arange(camera.height_px)[:, None] + offsets).ravel()
-    grid = np.stack(np.meshgrid(columns, rows), axis=-1)
-    rays, valid = camera.unproject(grid.reshape(-1, 2))
+    size = camera.width_px, camera.height_px
+    limit = getattr(camera, "angle_limit", None)
+    rays, valid = _rays(camera.model, tuple(camera.params.tolist()), size, limit, oversample)
+    place = _place_in_image(camera, cam_from_board, extent, rim, 2 + 5 * blur_px)
+    part = tuple(slice(s.start * oversample, s.stop * oversample) for s in place)
+    rays, valid = rays[part], valid[part]
     board_from_cam = cam_from_board.inverse()
-    origin, directions = board_from_cam.translation, np.nan_to_num(rays) @ board_from_cam.rotation.T
+    origin, directions = board_from_cam.translation, rays @ board_from_cam.rotation.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth = -origin[2] / directions[:, 2]
-        hits = np.nan_to_num(origin + depth[:, None] * directions, nan=1e6, posinf=1e6, neginf=1e6)
-    hits = np.where((valid & (depth > 0))[:, None], hits, 1e6)[:, :2] + extent / 2
+        depth = -origin[2] / directions[..., 2]
+        hits = np.nan_to_num(origin + depth[..., None] * directions, nan=1e6, posinf=1e6, neginf=1e6)
+    hits = np.where((valid & (depth > 0))[..., None], hits, 1e6)[..., :2] + extent / 2
     if board.kind == "aprilgrid":
-        hits[:, 1] = extent[1] - hits[:, 1]
-    maps = ((hits + rim) * pixels_per_m - 0.5).clip(-10, 1e5).astype(np.float32).reshape(*grid.shape)
+        hits[..., 1] = extent[1] - hits[..., 1]
+    maps = ((hits + rim) * pixels_per_m - 0.5).clip(-10, 1e5).astype(np.float32)
     fine = cv2.remap(
-        texture, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=90
+        texture,
+        maps[..., 0],
+        maps[..., 1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=background,
     )
     if blur_px > 0:
         fine = cv2.GaussianBlur(fine, (0, 0), blur_px * oversample)
-    image = cv2.resize(fine, (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA)
+    image = np.full((camera.height_px, camera.width_px), background, np.uint8)
+    wanted = (place[1].stop - place[1].start, place[0].stop - place[0].start)
+    image[place] = cv2.resize(fine, wanted, interpolation=cv2.INTER_AREA)
     return (image + rng.normal(0, 1.5, image.shape)).clip(0, 255).astype(np.uint8)
+
+
+def _place_in_image(
+    camera: CameraModel, cam_from_board: SE3, extent: np.ndarray, rim: np.ndarray, margin_px: float
+) -> tuple[slice, slice]:
+    """Rows and columns that hold the board; all where the lens does not see its whole outline."""
+    along = np.linspace(0, 1, 41)
+    ones = np.ones_like(along)
+    edges = [(along, 0 * ones), (along, ones), (0 * ones, along), (ones, along)]
+    unit = np.concatenate([np.stack(edge, axis=1) for edge in edges])
+    plane = (unit - 0.5) * (extent + 2 * rim)
+    pixels, valid = camera.project(cam_from_board * np.column_stack([plane, np.zeros(len(plane))]))
+    size = np.array([camera.width_px, camera.height_px])
+    if not valid.all():
+        return slice(0, int(size[1])), slice(0, int(size[0]))
+    low = np.floor(pixels.min(axis=0) - margin_px).clip(0, size - 1).astype(int)
+    high = np.ceil(pixels.max(axis=0) + margin_px + 1).clip(low + 1, size).astype(int)
+    return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))

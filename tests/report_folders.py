@@ -18,7 +18,19 @@ from rigwake.writers.trajectory_writer import write_tum
 START_NS = 1_700_000_000_000_000_000
 GOOD_CHECKS = {
     "split_half": {
-        name: {"rotation_deg": 0.011, "translation_m": [0.002, -0.003, 0.006], "sigmas": 1.1}
+        name: {
+            "rotation_deg": 0.011,
+            "translation_m": [0.002, -0.003, 0.006],
+            "sigmas": 1.1,
+            "halves": [
+                {
+                    "translation_m": [1.0 + k, 0.5, None],
+                    "std_translation_m": [0.004, 0.005, None],
+                    "std_rotation_deg": [0.01, 0.02, 0.03],
+                }
+                for k in (0, 1)
+            ],
+        }
         for name in ("front", "port", "starboard", "aft")
     },
     "hand_over": {
@@ -78,6 +90,7 @@ def write_folder(
         write_tum(path, folder / "trajectories" / f"{name}.tum")
         write_tracks(folder / "tracks" / f"{name}.npz", name, rig.timestamps_ns, observations, rng)
     write_residuals(folder / "residuals.npz", list(calibration.cameras), rig, observations, rng)
+    write_adjustment(folder / "adjustment.npz", list(calibration.cameras), rig, rng)
     write_masks(folder / "masks", list(calibration.cameras))
     write_pictures(folder / "pictures", list(calibration.cameras), pictures_per_camera, rng)
     return folder
@@ -119,6 +132,37 @@ def write_residuals(
         pixels=pixels,
         residuals_px=residuals,
         angle_deg=angle_deg,
+    )
+
+
+def write_adjustment(
+    path: Path, names: list[str], rig: Trajectory, rng: np.random.Generator, landmarks: int = 600
+) -> None:
+    """Sensors over time and a ring of landmarks on shore; one lies very far away."""
+    stamps = rig.timestamps_ns[::10]
+    n, around = len(stamps), rng.uniform(0, 2 * np.pi, landmarks)
+    shore = np.stack([45 * np.cos(around), 45 * np.sin(around), rng.uniform(0, 8, landmarks)], axis=1)
+    shore[0] = 1e6
+    np.savez_compressed(
+        path,
+        bias_timestamps_ns=stamps,
+        gyro_bias=1e-3 + 1e-5 * rng.normal(size=(n, 3)).cumsum(axis=0),
+        accel_bias=2e-2 + 1e-3 * rng.normal(size=(n, 3)).cumsum(axis=0),
+        imu_timestamps_ns=stamps,
+        imu_turn=2e-4 * rng.normal(size=(n, 3)),
+        imu_turn_std=np.full((n, 3), 2e-4),
+        imu_speed=3e-3 * rng.normal(size=(n, 3)),
+        imu_speed_std=np.full((n, 3), 2e-3),
+        imu_count=np.array(3 * n),
+        gnss_timestamps_ns=stamps,
+        gnss_off=0.02 * rng.normal(size=(n, 3)),
+        gnss_lasting=np.zeros((n, 3)),
+        gnss_std=np.full((n, 3), 0.02),
+        gnss_count=np.array(n),
+        camera_names=np.array(names),
+        landmarks_world=shore.astype(np.float32),
+        landmark_cameras=(np.arange(landmarks) % len(names)).astype(np.int16),
+        landmark_counts=np.array([5000, landmarks]),
     )
 
 
@@ -172,6 +216,17 @@ def write_pictures(folder: Path, names: list[str], per_camera: int, rng: np.rand
                     for i, p in enumerate(seen)
                 ]
                 entries.append({**entry, "kind": "hand_over", "points": points})
+    for k, off_px in enumerate((0.3, 6.0)):
+        tiles = [harbour_image(rng)[200:231, 300:331] for _ in range(3)]
+        cv2.imwrite(str(folder / f"patch_{k}.jpg"), cv2.resize(np.hstack(tiles), None, fx=5, fy=5))
+        point = {
+            "predicted_px": [310.0, 215.0],
+            "observed_px": [310.0 + off_px, 215.0],
+            "from_camera": names[0],
+            "landmark": k,
+        }
+        entry = {"camera": names[-1], "file": f"patch_{k}.jpg", "timestamp_ns": START_NS, "tile_px": 31}
+        entries.append({**entry, "kind": "patches", "points": [point]})
     (folder / "pictures.json").write_text(json.dumps(entries))
 
 

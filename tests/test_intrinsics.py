@@ -4,6 +4,7 @@ import gzip
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -22,7 +23,7 @@ from rigwake.intrinsics.board_observations import BoardObservations, BoardView, 
 from rigwake.intrinsics.board_pose import board_pose
 from rigwake.intrinsics.boards import Board, parse_board
 from rigwake.intrinsics.detect import detect_board, detect_corners
-from rigwake.intrinsics.saddles import fitted_saddles
+from rigwake.intrinsics.saddles import fitted_saddles, normals_of_grid
 from rigwake.intrinsics.select import choose, cross_validate
 
 BOARD = parse_board("aprilgrid:6x6:0.088:0.3")
@@ -294,8 +295,6 @@ def test_aprilgrid_corners_are_found_to_a_tenth_of_a_pixel_in_a_fisheye_image() 
 
 
 def test_images_without_a_board_or_of_two_sizes(tmp_path: Path) -> None:
-    import cv2
-
     for k, width in enumerate((640, 640, 320)):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((480, width), 128, np.uint8))
     files = sorted(tmp_path.iterdir())
@@ -308,8 +307,6 @@ def test_images_without_a_board_or_of_two_sizes(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["kb4", "mei", "scaramuzza"])
 def test_from_rendered_images_to_a_camera_file(model: str, tmp_path: Path) -> None:
-    import cv2
-
     truth, board = wide_lens(model), parse_board("aprilgrid:6x6:0.088:0.3")
     rng = np.random.default_rng(0)
     poses = looking_poses(np.deg2rad(65), 20, rng, 0.4)
@@ -370,12 +367,44 @@ def test_corners_are_fitted_alike_in_sharp_and_soft_pictures(blur_px: float, wit
     image = render_board(camera, board, cam_from_board, rng, blur_px=blur_px)
     truth, _ = camera.project(cam_from_board * centred_points(board))
     start = truth + rng.uniform(-0.4, 0.4, truth.shape)
-    errors = fitted_saddles(image, start.reshape(board.rows, board.columns, 2)) - truth
+    errors = fitted(image, start.reshape(board.rows, board.columns, 2)) - truth
     assert np.sqrt(np.mean(errors**2)) < within_px
     assert np.abs(errors.mean(axis=0)).max() < within_px / 3
 
 
 def test_corners_at_the_border_of_the_image_are_left_as_they_are() -> None:
     grid = np.stack(np.meshgrid(np.arange(4) * 20.0 + 2, np.arange(3) * 20.0 + 30), axis=-1)
-    fitted = fitted_saddles(np.full((100, 100), 90, np.uint8), grid).reshape(3, 4, 2)
-    assert np.isnan(fitted[:, 0]).all()
+    x, y = np.meshgrid(np.arange(100), np.arange(100))
+    image = np.where((np.floor((x - 2) / 20) + np.floor((y - 30) / 20)) % 2 == 0, 200, 60).astype(np.uint8)
+    found = fitted(image, grid).reshape(3, 4, 2)
+    assert np.isnan(found[:, 0]).all()
+    assert np.isfinite(found[:, 1:]).all()
+
+
+def fitted(image: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
+    return fitted_saddles(image, grid.reshape(-1, 2), normals_of_grid(grid), min(sides))
+
+
+@pytest.mark.parametrize("blur_px", [0.3, 0.6, 1.0])
+def test_corners_of_an_aprilgrid_are_fitted_as_those_of_a_chessboard(blur_px: float) -> None:
+    """Gradients are off by 0.02 px, and OpenCV's quads by 3 px."""
+    camera = camera_from_params("pinhole", [520, 522, 322, 238, 0, -0.2, 0.05, 0, 0, 0], 640, 480)
+    board, rng = parse_board("aprilgrid:5x4:0.04:0.3"), np.random.default_rng(2)
+    cam_from_board = SE3(so3.exp([0.4 - np.pi, -0.3, 0.2]), np.array([0.01, 0.01, 0.5]))
+    ids, pixels = detect_corners(board, render_board(camera, board, cam_from_board, rng, blur_px=blur_px))
+    truth, _ = camera.project(cam_from_board * centred_points(board)[ids])
+    assert len(ids) >= 72
+    assert np.sqrt(np.mean((pixels - truth) ** 2)) < 0.008
+    assert np.abs(pixels - truth).max() < 0.04
+
+
+def test_a_corner_of_a_single_dark_square_is_not_fitted() -> None:
+    """As of AprilGrids that are printed without squares between their tags."""
+    image = np.full((60, 60), 210, np.uint8)
+    image[30:, 30:] = 40
+    image = cv2.GaussianBlur(image, (0, 0), 0.6)
+    at, normals = np.array([[30.0, 30.0]]), [np.array([np.pi / 2]), np.array([0.0])]
+    assert np.isnan(fitted_saddles(image, at, normals, 12.0)).all()
+    image[:30, :30] = 40
+    assert np.isfinite(fitted_saddles(image, at, normals, 12.0)).all()

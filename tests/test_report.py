@@ -60,6 +60,9 @@ def test_everything_has_a_panel(page: str) -> None:
         "Cross-camera association between cameras",
         "Cross-camera association pictures",
         "Horizon",
+        "Landmarks from camera to camera, enlarged",
+        "IMU over time",
+        "GNSS over time",
         "Motion of the rig",
         "Coverage of the images",
         "Masks",
@@ -71,6 +74,39 @@ def test_everything_has_a_panel(page: str) -> None:
     assert "harbour.bag" in page
 
 
+def test_what_stands_behind_each_figure_is_said(page: str) -> None:
+    assert "4,000 observations" in page  # the histogram's
+    assert "Scatter of the residuals" in page
+    assert "120 values" in page  # of 60 s
+    assert "120 of 360 values" in page
+    assert "rms 0.2" in page  # mrad, of the gyroscope
+    assert "599 landmarks about the path" in page
+    assert "of 5,000 in the adjustment, 600 are" in page
+    scenes = json.loads(re.search(r'id="scenes">(.*?)</script>', page, re.DOTALL).group(1))
+    assert sum(len(cloud["points"]) for cloud in scenes["paths"]["cloud"]) == 599
+    assert scenes["paths"]["grid"]["x_names"][0].endswith(" m")
+    assert scenes["rig"]["dimensions"] in page
+    assert '<path class="cloud' in page
+
+
+def test_halves_have_their_own_sigmas(page: str) -> None:
+    row = re.search(r"<td>first</td>(.*?)</tr>", page, re.DOTALL).group(1)
+    text = " ".join(re.sub("<[^>]*>", " ", row).split())
+    assert text == "1000.0 ± 4.0 mm 500.0 ± 5.0 mm unobservable ± 0.030 °"
+
+
+def test_landmarks_that_lie_wrong_are_marked(page: str) -> None:
+    tiles = re.findall(r'<figure class="patch( bad)?">.*?</figure>', page, re.DOTALL)
+    assert tiles == ["", " bad"]
+    assert "6.00 px off <b>bad</b>" in page
+
+
+def test_a_huge_adjustment_file_is_not_loaded(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    np.savez_compressed(copy / "adjustment.npz", gyro_bias=np.zeros((3_000_000, 3)))
+    assert "too large" in load_report_content(copy).absent["adjustment"]
+
+
 def test_svg_is_well_formed(page: str) -> None:
     drawings = re.findall(r'<svg class="(?:chart|map)".*?</svg>', page, re.DOTALL)
     assert len(drawings) >= 12
@@ -80,7 +116,8 @@ def test_svg_is_well_formed(page: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["initial_rig.yaml", "trajectories", "tracks", "residuals.npz", "masks", "pictures"]
+    "name",
+    ["initial_rig.yaml", "trajectories", "tracks", "residuals.npz", "adjustment.npz", "masks", "pictures"],
 )
 def test_a_panel_without_its_file_says_so(folder: Path, tmp_path: Path, name: str) -> None:
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
@@ -100,7 +137,7 @@ def test_a_calibration_alone_is_enough(tmp_path: Path) -> None:
 def damage(folder: Path, name: str) -> None:
     file = folder / name
     if name.endswith(".npz"):
-        np.savez(file, camera=np.zeros(3, int))
+        np.savez(file, camera=np.zeros(3, int), imu_turn=np.zeros((3, 3)))
     elif name.endswith(".json"):
         file.write_text(
             '[{"camera": "front", "file": "../calibration.yaml", "timestamp_ns": 1, "kind": "horizon"}]'
@@ -113,6 +150,7 @@ def damage(folder: Path, name: str) -> None:
     ("name", "words"),
     [
         ("residuals.npz", "residuals.npz cannot be read"),
+        ("adjustment.npz", "adjustment.npz cannot be read"),
         ("tracks/front.npz", "front.npz cannot be read"),
         ("trajectories/front.tum", "front.tum"),
         ("masks/front.png", "front.png is not an image"),

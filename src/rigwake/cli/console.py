@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderableType, RenderHook, RenderResult
 from rich.markup import escape
-from rich.panel import Panel
-from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
@@ -23,7 +21,9 @@ from rich.text import Text
 from rigwake.atomic import write_text_atomic
 from rigwake.errors import RigwakeError
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # what only long work needs would slow the completion of the shell down
+    from rich.progress import Progress, TaskID
+
     from rigwake.calibration import Calibration
 
 # what could move the cursor, colour the terminal, or turn the direction of writing: shown, not done
@@ -95,6 +95,8 @@ def _in_ascii(error: UnicodeError) -> tuple[str, int]:
 
 def print_error(error: RigwakeError) -> None:
     """Cause, consequence and remedy in a panel on stderr."""
+    from rich.panel import Panel
+
     lines = [f"[bold]{escape(error.cause)}[/bold]"]
     if error.consequence:
         lines.append(escape(error.consequence))
@@ -181,6 +183,8 @@ class PlainProgress:
 
     def add_task(self, description: str, total: float = 1.0) -> TaskID:
         """Another thing that is done."""
+        from rich.progress import TaskID
+
         self._tasks.append({"what": description, "done": 0.0, "total": total, "said": ("", 0.0)})
         return TaskID(len(self._tasks) - 1)
 
@@ -214,16 +218,21 @@ _SECONDS_BETWEEN_LINES = 10.0
 @contextmanager
 def progress_bar() -> Iterator[Progress | PlainProgress]:
     """The progress of long work, on stderr: a bar that is gone when done, or plain lines where that is no terminal."""
-    with _progress(TextColumn("{task.completed:.0f}/{task.total:.0f}"), TimeRemainingColumn()) as progress:
+    with _progress("{task.completed:.0f}/{task.total:.0f}", remaining=True) as progress:
         yield progress
 
 
 @contextmanager
-def _progress(*figures: Any) -> Iterator[Progress | PlainProgress]:
+def _progress(figures: str, remaining: bool = False) -> Iterator[Progress | PlainProgress]:
+    """figures: the form of what stands behind the bar. remaining: whether the time that is left is said as well."""
     if not err.is_terminal:
         yield PlainProgress()
         return
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), *figures)
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+    columns = [SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TextColumn(figures)]
+    if remaining:
+        columns.append(TimeRemainingColumn())
     with Progress(*columns, console=err, transient=True) as progress:
         yield progress
 
@@ -245,7 +254,7 @@ class ProgressBars:
 @contextmanager
 def progress_bars() -> Iterator[ProgressBars]:
     """Progress of things done at the same time, on stderr: bars that are gone when done, or plain lines."""
-    with _progress(TextColumn("{task.percentage:.0f} %")) as progress:
+    with _progress("{task.percentage:.0f} %") as progress:
         yield ProgressBars(progress)
 
 

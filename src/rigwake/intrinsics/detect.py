@@ -16,7 +16,7 @@ from rigwake._types import Array
 from rigwake.errors import EstimationError, UsageError
 from rigwake.intrinsics.board_observations import MIN_CORNERS, BoardObservations, BoardView, gathered
 from rigwake.intrinsics.boards import Board
-from rigwake.intrinsics.saddles import fitted_saddles
+from rigwake.intrinsics.saddles import fitted_saddles, normals_of_grid
 from rigwake.readers.picture_files import IMAGE_SUFFIXES, picture_or_none
 
 Grey = NDArray[np.uint8]
@@ -25,6 +25,7 @@ Found = tuple[NDArray[np.int64], Array]  # corner ids and pixels
 _SUBPIXEL_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
 _SMALLEST_TAG_PX = 12.0  # below, the window of the refinement would hold more than one corner
 _WINDOW_OF_SQUARE = 0.3  # half the window, as a fraction of the shortest side of a square
+_ROOM_OF_BORDER = 1.4  # what lies beyond the border is far from the edges and weighs little
 _FARTHEST_REFINEMENT_PX = 1.5  # farther, the window has found something else, such as glare
 _BORDER_BITS = (2, 1)  # Kalibr prints its tags with a border of two bits, AprilTag's own have one
 _NOTHING: Found = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
@@ -56,7 +57,8 @@ def _refined_saddles(image: Grey, grid: Array) -> Array:
     start = grid.reshape(-1, 1, 2).astype(np.float32)
     refined = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), _SUBPIXEL_STOP)
     refined = _unless_far(np.asarray(refined, dtype=np.float64).reshape(-1, 2), grid.reshape(-1, 2))
-    return _unless_far(fitted_saddles(image, refined.reshape(grid.shape)), refined)
+    normals = normals_of_grid(refined.reshape(grid.shape))
+    return _unless_far(fitted_saddles(image, refined, normals, float(min(sides))), refined)
 
 
 def _unless_far(refined: Array, before: Array) -> Array:
@@ -89,9 +91,11 @@ def _tag_detector(border_bits: int) -> cv2.aruco.ArucoDetector:
 
 def _aprilgrid(board: Board, image: Grey) -> Found:
     tags: dict[int, Array] = {}
+    border = 0.0  # width of the black border, as a fraction of the tag
     for border_bits in _BORDER_BITS:
         quads, ids, _ = _tag_detector(border_bits).detectMarkers(image)
         if ids is not None and len(ids) > len(tags):
+            border = border_bits / (6 + 2 * border_bits)
             # OpenCV goes clockwise from the top left; the board counter-clockwise from the bottom left
             tags = {
                 int(i): np.asarray(quad, dtype=np.float64).reshape(4, 2)[::-1]
@@ -105,7 +109,7 @@ def _aprilgrid(board: Board, image: Grey) -> Found:
     turn = _tag_turn(board, tags)
     ids_out, pixels = [], []
     for tag, quad in tags.items():
-        refined = _refined_tag(board, image, np.roll(quad, -turn, axis=0))
+        refined = _refined_tag(board, image, np.roll(quad, -turn, axis=0), border)
         if refined is not None:
             ids_out.append(4 * tag + np.arange(4))
             pixels.append(refined)
@@ -135,9 +139,15 @@ def _tag_turn(board: Board, tags: dict[int, Array]) -> int:
     return int(np.argmin(errors))
 
 
-def _refined_tag(board: Board, image: Grey, quad: Array) -> Array | None:
-    """The four corners refined in windows that hold one corner each, or None if that fails."""
-    shortest = float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min())
+def _refined_tag(board: Board, image: Grey, quad: Array, border: float) -> Array | None:
+    """The four corners refined in windows that hold one corner each, or None if that fails.
+
+    The detector's quads lie up to 4 px inside of the tag; gradients, in windows that reach as far, bring them to a few
+    hundredths, edges fitted in windows as wide as the tag's black `border` (a fraction of its side) or the gap's black
+    squares to a tenth of that. Where there are no such squares, corners stay as gradients say.
+    """
+    sides = np.roll(quad, -1, axis=0) - quad
+    shortest = float(np.linalg.norm(sides, axis=1).min())
     if shortest < _SMALLEST_TAG_PX:
         return None
     half = int(np.clip(round(0.5 * min(board.spacing, 0.5) * shortest), 2, 8))
@@ -147,7 +157,12 @@ def _refined_tag(board: Board, image: Grey, quad: Array) -> Array | None:
     start = quad.astype(np.float32).reshape(-1, 1, 2)
     refined = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), _SUBPIXEL_STOP)
     refined = np.asarray(refined, dtype=np.float64).reshape(4, 2)
-    return refined if np.linalg.norm(refined - quad, axis=1).max() <= half else None
+    moved = np.linalg.norm(refined - quad, axis=1)
+    if moved.max() > half or moved.min() == 0:  # what leaves its window is put back
+        return None
+    normals = [np.arctan2(s[:, 1], s[:, 0]) + np.pi / 2 for s in (sides, np.roll(sides, 1, axis=0))]
+    room_px = _ROOM_OF_BORDER * min(board.spacing, border) * shortest
+    return _unless_far(fitted_saddles(image, refined, normals, room_px), refined)
 
 
 def list_images(paths: Iterable[Path]) -> list[Path]:

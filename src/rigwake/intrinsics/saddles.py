@@ -1,4 +1,4 @@
-"""Corners of chessboards where two blurred edges cross, by least squares on grey values.
+"""Corners where two blurred edges cross, of chessboards and AprilGrids, by least squares on grey values.
 
 What is fitted is `offset + contrast * erf(s / b) * erf(t / b)`: s and t are the distances from two lines through the
 corner, b is the blur, which is learnt at every corner, so that sharp and soft pictures are treated alike. Refinement by
@@ -8,6 +8,7 @@ are wrong, and alike over a whole view.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,11 +17,12 @@ from scipy.special import erf
 
 from rigwake._types import Array
 
-_WINDOW_OF_SQUARE = 0.45  # half the window, as a fraction of the shortest side of a square
+_WINDOW_OF_ROOM = 0.45  # half the window, whose corners reach further, as a fraction of the room
 _HALF_PX = (2, 7)
 _ROUNDS = 12
 _BLUR_PX = (0.289, 3.0)  # from what the area of a pixel blurs by itself
 _START_BLUR_PX = 0.5
+_MOST_UNEXPLAINED = 0.12  # of the grey values' spread: a corner of a single dark square leaves more
 _FADE = 0.6  # standard deviation of the weights, as a fraction of half the window: edges are straight near the corner
 _BLUR, _OFFSET, _CONTRAST = 4, 5, 6  # after the corner (2) and the directions of the two normals
 
@@ -31,11 +33,14 @@ class _SaddleFit(NamedTuple):
     residuals: Array  # (N, K), weighted
 
 
-def fitted_saddles(image: NDArray[np.uint8], grid: Array) -> Array:
-    """(N, 2) corners, given as (rows, columns, 2) to a pixel or better; NaN where the window leaves the image."""
-    sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
-    half = int(np.clip(round(_WINDOW_OF_SQUARE * min(sides)), *_HALF_PX))
-    start = grid.reshape(-1, 2)
+def fitted_saddles(image: NDArray[np.uint8], start: Array, normals: Sequence[Array], room_px: float) -> Array:
+    """(N, 2) corners, given as `start` (N, 2) to a pixel or better; NaN where the window leaves the image or where no
+    two edges cross.
+
+    normals: of both edges, angles (N,) in the image to some 20 degrees. room_px: how far from the corner nothing but
+    its two edges is seen.
+    """
+    half = int(np.clip(round(_WINDOW_OF_ROOM * room_px), *_HALF_PX))
     nearest = np.round(start).astype(np.int64)
     steps = np.arange(-half, half + 1)
     window = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
@@ -43,17 +48,24 @@ def fitted_saddles(image: NDArray[np.uint8], grid: Array) -> Array:
     inside = np.all((nearest >= half) & (nearest < size - half), axis=1)
     pixels = (nearest[:, None] + window).clip(0, size - 1)
     values = image[pixels[..., 1], pixels[..., 0]].astype(np.float64)
-    normals = [
+    weights = np.exp(-(window**2).sum(axis=1) / (2 * _FADE * half) ** 2)
+    fit = _fit(values, window.astype(np.float64), weights, start - nearest, normals)
+    means = (values @ weights**2 / (weights**2).sum())[:, None]
+    spread = (((values - means) * weights) ** 2).sum(axis=1)
+    good = inside & ((fit.residuals**2).sum(axis=1) < _MOST_UNEXPLAINED * spread)
+    return np.where(good[:, None], nearest + fit.params[:, :2], np.nan)
+
+
+def normals_of_grid(grid: Array) -> list[Array]:
+    """Of the edges that cross at the corners (rows, columns, 2) of a chessboard: angles (N,) along rows and columns."""
+    return [
         np.arctan2(along[..., 1], along[..., 0]).ravel() + np.pi / 2
         for along in (np.gradient(grid, axis=1), np.gradient(grid, axis=0))
     ]
-    weights = np.exp(-(window**2).sum(axis=1) / (2 * _FADE * half) ** 2)
-    corners = _fit(values, window.astype(np.float64), weights, start - nearest, normals)
-    return np.where(inside[:, None], nearest + corners, np.nan)
 
 
-def _fit(values: Array, window: Array, weights: Array, start: Array, normals: list[Array]) -> Array:
-    """Corners (N, 2) in their windows, by damped Gauss-Newton steps, each corner by itself."""
+def _fit(values: Array, window: Array, weights: Array, start: Array, normals: Sequence[Array]) -> _SaddleFit:
+    """Every corner in its window, by damped Gauss-Newton steps, each corner by itself."""
     count = len(values)
     params = np.column_stack(
         [start, *normals, np.full(count, _START_BLUR_PX), np.zeros(count), np.ones(count)]
@@ -79,7 +91,7 @@ def _fit(values: Array, window: Array, weights: Array, start: Array, normals: li
             np.where(better[:, None], new.residuals, fit.residuals),
         )
         damping = np.where(better, damping / 5, damping * 5)
-    return fit.params[:, :2]
+    return fit
 
 
 def _saddle_fit(params: Array, values: Array, window: Array, weights: Array) -> _SaddleFit:

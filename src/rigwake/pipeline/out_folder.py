@@ -21,7 +21,7 @@ else:
 
 _LOCK = ".rigwake.lock"
 RESULT_FILES = ("calibration.yaml", "report.html")  # those by which others judge that a result is there
-_OTHER_FILES = ("initial_rig.yaml", "residuals.npz", "stages.json")
+_OTHER_FILES = ("initial_rig.yaml", "residuals.npz", "adjustment.npz", "stages.json")
 _STAGE_FOLDERS = ("tracks", "odometry", "masks", "trajectories", "pictures")
 _LONGEST_NAME = 200  # bytes; the usual limit is 255, and names of files add to the camera's
 _TAKEN_NAMES = ("rig",)  # trajectories/rig.tum is the rig's own

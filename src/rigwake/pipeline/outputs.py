@@ -18,6 +18,8 @@ from rigwake.ba.rig.search_proposals import camera_from_world
 from rigwake.ba.solver.rig_problem import RigProblem
 from rigwake.calibration import Calibration, save_calibration
 from rigwake.cameras.protocol import CameraModel
+from rigwake.pipeline.adjustment_record import write_adjustment
+from rigwake.pipeline.association_patches import write_patches
 from rigwake.pipeline.stream_selection import Selection
 from rigwake.recording import CameraStream
 from rigwake.trajectory import Trajectory
@@ -40,6 +42,7 @@ def write_outputs(
     problem = adjusted.solution.problem
     write_trajectories(out / "trajectories", problem)
     _write_residuals(out / "residuals.npz", adjusted)
+    write_adjustment(out / "adjustment.npz", problem)
     is_level = problem.imu is not None or problem.gnss is not None
     _write_pictures(out / "pictures", problem, selection.cameras, matches, is_level)
     save_calibration(calibration, out / "calibration.yaml")
@@ -97,6 +100,7 @@ def _write_pictures(
             points = _association_points(problem, matches, index, stamp, rows)
             entry = {"kind": "hand_over", "horizon_px": [], "points": points}
             entries += _save_picture(folder, stream, stamp, len(entries), entry)
+    entries += write_patches(folder, problem, streams, matches.unused)
     write_text_atomic(folder / "pictures.json", json.dumps(_without_nan(entries)) + "\n")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from markupsafe import Markup, escape
@@ -13,6 +13,8 @@ from rigwake.report.reduce import ImageMap
 
 WIDTH, HEIGHT = 480.0, 220.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 54.0, 26.0, 26.0, 42.0
+CLOUD_REACH = 1.0
+_SHADES = 12
 COLOURS = 8
 """Length of the palette; series beyond it differ by dashes as well."""
 
@@ -101,8 +103,8 @@ def _line(series: Series, at) -> list[str]:  # type: ignore[no-untyped-def]
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
     parts = []
     if series.is_dots:
-        drawn = (point.split(",") for point in at(series.x[known], series.y[known]))
-        return [f'<circle class="dot {css}" cx="{u}" cy="{v}" r="1.6"/>' for u, v in drawn]
+        dots = "".join(f"M{point}h0" for point in at(series.x[known], series.y[known]))
+        return [f'<path class="dots {css}" d="{dots}"/>']
     for start, end in zip(edges[::2], edges[1::2], strict=True):
         x, y = series.x[start:end], series.y[start:end]
         if series.upper is not None:
@@ -124,12 +126,15 @@ def image_map(title: str, data: ImageMap, colour: int) -> Markup:
     du, dv = width / columns, height / rows
     most = max(float(data.counts.max()), 1.0)
     parts = [f'<rect class="frame" width="{width:.1f}" height="{height:.1f}"/>']
-    for r, c in zip(*np.nonzero(data.counts), strict=True):
-        fraction = np.sqrt(data.counts[r, c] / most)
-        parts.append(
-            f'<rect class="cell c{colour % COLOURS}" x="{c * du:.1f}" y="{r * dv:.1f}" width="{du:.2f}" '
-            f'height="{dv:.2f}" fill-opacity="{0.12 + 0.6 * fraction:.2f}"/>'
+    # one element per shade: thousands of them make a page slow
+    shades = np.ceil(_SHADES * np.sqrt(data.counts / most)).astype(int)
+    for shade in np.unique(shades[shades > 0]).tolist():
+        cells = "".join(
+            f"M{c * du:.1f},{r * dv:.1f}h{du:.2f}v{dv:.2f}h{-du:.2f}z"
+            for r, c in zip(*np.nonzero(shades == shade), strict=True)
         )
+        opacity = f'fill-opacity="{0.12 + 0.6 * shade / _SHADES:.2f}"'
+        parts.append(f'<path class="cell c{colour % COLOURS}" {opacity} d="{cells}"/>')
     if data.mean_px is not None:
         parts += _arrows(data.mean_px, du, dv)
     return svg(title, width, height, parts, "map")
@@ -145,45 +150,71 @@ def arrow_scale(data: ImageMap) -> float:
 
 def _arrows(mean_px: Array, du: float, dv: float) -> list[str]:
     scale = arrow_scale(ImageMap(1, 1, np.zeros((1, 1)), mean_px)) or 1.0
-    parts = []
+    lines, tails = [], []
     for r, c in zip(*np.nonzero(np.isfinite(mean_px).all(axis=-1)), strict=True):
         u, v = mean_px[r, c] / scale * min(du, dv)
-        x, y = (c + 0.5) * du, (r + 0.5) * dv
-        parts.append(f'<path class="arrow" d="M{x:.1f},{y:.1f}l{u:.2f},{v:.2f}"/>')
-        parts.append(f'<circle class="tail" cx="{x:.1f}" cy="{y:.1f}" r="0.9"/>')
-    return parts
+        start = f"M{(c + 0.5) * du:.1f},{(r + 0.5) * dv:.1f}"
+        lines.append(f"{start}l{u:.2f},{v:.2f}")
+        tails.append(f"{start}h0")
+    return [f'<path class="arrow" d="{"".join(lines)}"/>', f'<path class="tail" d="{"".join(tails)}"/>']
 
 
-def top_view(title: str, paths: Sequence[Series], unit: str = "m") -> Markup:
-    """Paths seen from above at one scale, with a bar that gives it in `unit`; squares mark the starts."""
+def top_view(title: str, paths: Sequence[Series], unit: str = "m", cloud: Sequence[Series] = ()) -> Markup:
+    """Paths seen from above at one scale, over a grid whose lines are named in `unit`; squares mark the starts.
+
+    cloud: points below the paths; what lies further out than `CLOUD_REACH` times the paths' extent is left out.
+    """
     drawn = [s for s in paths if np.isfinite(s.y).any()]
     if not drawn:
         return Markup("")
     (x_low, x_high), (y_low, y_high) = _range([s.x for s in drawn]), _range([s.y for s in drawn])
+    near = [_near(s, (x_low, x_high), (y_low, y_high)) for s in cloud]
+    (x_low, x_high), (y_low, y_high) = (
+        _range([s.x for s in (*drawn, *near)]),
+        _range([s.y for s in (*drawn, *near)]),
+    )
     span = max(x_high - x_low, y_high - y_low, 1e-6)
-    width, margin = 420.0, 24.0
-    scale = (width - 2 * margin) / span
-    height = (y_high - y_low) * scale + 2 * margin + 26
+    width, left, margin, bottom = 460.0, 44.0, 14.0, 40.0
+    scale = (width - left - margin) / span
+    height = (y_high - y_low) * scale + 2 * margin + bottom
 
     def at(x: Array, y: Array) -> list[str]:
-        u, v = margin + (x - x_low) * scale, height - margin - 26 - (y - y_low) * scale
+        u, v = left + (x - x_low) * scale, height - margin - bottom - (y - y_low) * scale
         return [f"{a:.1f},{b:.1f}" for a, b in zip(u.tolist(), v.tolist(), strict=True)]
 
     parts = []
+    for x in ticks(x_low, x_high):
+        u, label = left + (x - x_low) * scale, f'text-anchor="middle">{axis_text(x)}</text>'
+        parts.append(f'<path class="grid" d="M{u:.1f},{margin:.1f}V{height - bottom:.1f}"/>')
+        parts.append(f'<text class="tick" x="{u:.1f}" y="{height - bottom + 15:.1f}" {label}')
+    for y in ticks(y_low, y_high, max(1, round(5 * (y_high - y_low) / span))):
+        v, label = height - margin - bottom - (y - y_low) * scale, f'text-anchor="end">{axis_text(y)}</text>'
+        parts.append(f'<path class="grid" d="M{left:.1f},{v:.1f}H{width - margin:.1f}"/>')
+        parts.append(f'<text class="tick" x="{left - 5:.1f}" y="{v + 4:.1f}" {label}')
+    for series in near:
+        dots = "".join(f"M{point}h0" for point in at(series.x, series.y))
+        parts.append(f'<path class="cloud c{series.colour % COLOURS}" d="{dots}"/>')
     for series in drawn:
         parts += _line(series, at)
-        u, v = at(series.x[:1], series.y[:1])[0].split(",")
+        u_, v_ = at(series.x[:1], series.y[:1])[0].split(",")
         parts.append(
-            f'<rect class="dot c{series.colour % COLOURS}" x="{float(u) - 4:.1f}" y="{float(v) - 4:.1f}" '
+            f'<rect class="dot c{series.colour % COLOURS}" x="{float(u_) - 4:.1f}" y="{float(v_) - 4:.1f}" '
             'width="8" height="8"/>'
         )
-    bar = ticks(0, span, 4)[1] if len(ticks(0, span, 4)) > 1 else span
-    y = height - 14
-    parts.append(f'<path class="scalebar" d="M{margin:.1f},{y:.1f}h{bar * scale:.1f}"/>')
+    words = f"{x_high - x_low:.3g} {unit} across, {y_high - y_low:.3g} {unit} along"
     parts.append(
-        f'<text class="tick" x="{margin:.1f}" y="{y - 5:.1f}">{axis_text(bar)} {escape(unit)}</text>'
+        f'<text class="axis" x="{(width + left) / 2:.1f}" y="{height - 6:.1f}" text-anchor="middle">'
+        f"{escape(words)}</text>"
     )
     return svg(title, width, height, parts, "map")
+
+
+def _near(cloud: Series, x: tuple[float, float], y: tuple[float, float]) -> Series:
+    """The points of a cloud about a box."""
+    reach = CLOUD_REACH * max(x[1] - x[0], y[1] - y[0])
+    inside = (cloud.x > x[0] - reach) & (cloud.x < x[1] + reach)
+    inside &= (cloud.y > y[0] - reach) & (cloud.y < y[1] + reach)
+    return replace(cloud, x=cloud.x[inside], y=cloud.y[inside])
 
 
 def svg(title: str, width: float, height: float, parts: Sequence[str], css: str) -> Markup:

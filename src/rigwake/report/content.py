@@ -19,6 +19,7 @@ from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import InputError, RigwakeError
 from rigwake.readers.picture_files import picture_or_none
 from rigwake.readers.trajectories import read_trajectory
+from rigwake.report.adjustment_file import AdjustmentRecord, read_adjustment
 from rigwake.report.reduce import ResidualSummary, TrackSummary, summarise_residuals, summarise_tracks
 from rigwake.trajectory import Trajectory
 
@@ -43,7 +44,9 @@ class OverlayPoint:
 class Picture:
     """One image of the recording with what the calibration says about it.
 
-    kind: `horizon` (horizon_px: the predicted horizon as a polyline, NaN between pieces) or `association` (points).
+    kind: `horizon` (horizon_px: the predicted horizon as a polyline, NaN between pieces), `hand_over` (points), or
+    `patches` (one point; three tiles side by side, each `tile_px` pixels of the recording wide and high, about the
+    prediction: as seen before, as predicted, as found).
     """
 
     camera: str
@@ -52,6 +55,7 @@ class Picture:
     kind: str
     horizon_px: tuple[tuple[float, float], ...] = ()
     points: tuple[OverlayPoint, ...] = ()
+    tile_px: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +71,7 @@ class ReportContent:
     trajectories: Mapping[str, Trajectory] = field(default_factory=dict)
     tracks: Mapping[str, TrackSummary] = field(default_factory=dict)
     residuals: Mapping[str, ResidualSummary] = field(default_factory=dict)
+    adjustment: AdjustmentRecord = field(default_factory=AdjustmentRecord)
     masks: Mapping[str, np.ndarray] = field(default_factory=dict)
     pictures: tuple[Picture, ...] = ()
     absent: Mapping[str, str] = field(default_factory=dict)
@@ -106,6 +111,7 @@ def load_report_content(folder: Path | str) -> ReportContent:
         trajectories=read("trajectories", folder / "trajectories", _read_trajectories, nothing),
         tracks=read("tracks", folder / "tracks", lambda f: _read_tracks(f, lenses), nothing),
         residuals=read("residuals", folder / "residuals.npz", lambda f: _read_residuals(f, lenses), nothing),
+        adjustment=read("adjustment", folder / "adjustment.npz", read_adjustment, AdjustmentRecord()),
         masks=read("masks", folder / "masks", _read_masks, nothing),
         pictures=read("pictures", folder / "pictures" / "pictures.json", _read_pictures, ()),
         absent=absent,
@@ -201,6 +207,7 @@ def _picture(entry: Any, folder: Path) -> Picture:
             )
             for p in entry.get("points") or ()
         ),
+        float(entry.get("tile_px") or 0.0),
     )
 
 

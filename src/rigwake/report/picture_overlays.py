@@ -14,6 +14,7 @@ from rigwake.report.content import OverlayPoint, Picture
 
 BUDGET_BYTES = 8_000_000
 _WIDTHS_PX = (960, 720, 540, 400, 300)
+_PATCH_WIDTH_PX = 480
 _QUALITY = 78
 # unused grey, hull orange, water blue, sky light blue: BGRA
 _MASK_COLOURS = np.array(
@@ -40,13 +41,20 @@ class EmbeddedPicture:
 def embed_pictures(pictures: Sequence[Picture]) -> tuple[list[EmbeddedPicture], list[str]]:
     """All pictures within the budget, and the names of those that cannot be read."""
     embedded, unreadable = [], []
-    fraction = BUDGET_BYTES * 3 // 4 // max(len(pictures), 1)  # base64 makes four bytes of three
+    whole = sum(picture.kind != "patches" for picture in pictures)  # patches are small however many
+    fraction = BUDGET_BYTES * 3 // 4 // max(whole, 1)  # base64 makes four bytes of three
     for picture in pictures:
         image = picture_or_none(picture.file, cv2.IMREAD_COLOR)
         if image is None:
             unreadable.append(picture.file.name)
             continue
         height_px, width_px = image.shape[:2]
+        if picture.kind == "patches":
+            if picture.tile_px <= 0 or len(picture.points) != 1:
+                unreadable.append(picture.file.name)
+                continue
+            width = min(width_px, _PATCH_WIDTH_PX)
+            image = cv2.resize(image, (width, max(1, round(height_px * width / width_px))))
         embedded.append(
             EmbeddedPicture(
                 picture,

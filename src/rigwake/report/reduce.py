@@ -15,6 +15,8 @@ from rigwake.cameras.protocol import CameraModel
 MAP_COLUMNS, MAP_ROWS = 24, 18
 ANGLE_STEP_DEG = 5.0
 TIME_BINS = 80
+HISTOGRAM_BINS, HISTOGRAM_PX = 30, 1.5
+SCATTER_CELLS = 25
 FEWEST = 10
 """Bins with fewer observations than this show nothing."""
 
@@ -41,7 +43,11 @@ class BinnedCurve:
 
 @dataclass(frozen=True, eq=False)
 class ResidualSummary:
-    """Reprojection residuals of one camera: counts, sizes, and where and when they are large."""
+    """Reprojection residuals of one camera: counts, sizes, and where and when they are large.
+
+    histogram_px: middles of bins of the size; histogram: (bins,) counts, the last bin takes what is larger.
+    scatter: counts over a square of side 2 * reach_px about zero, u to the right and v down; beyond: those outside.
+    """
 
     count: int
     rms_px: float
@@ -49,6 +55,11 @@ class ResidualSummary:
     image: ImageMap
     over_angle: BinnedCurve
     over_time: BinnedCurve
+    histogram_px: Array
+    histogram: Array
+    scatter: ImageMap
+    reach_px: float
+    beyond: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +87,9 @@ def summarise_residuals(arrays: Mapping[str, np.ndarray], lens: CameraModel | No
     angle = arrays["angle_deg"][finite]
     angle_edges = np.arange(0.0, np.nanmax(angle, initial=1.0) + ANGLE_STEP_DEG, ANGLE_STEP_DEG)
     time_edges = np.linspace(0.0, max(float(seconds.max(initial=0.0)), 1e-3), TIME_BINS + 1)
+    width = HISTOGRAM_PX / HISTOGRAM_BINS
+    bins = np.minimum((size / width).astype(np.int64), HISTOGRAM_BINS - 1)
+    scatter, reach, beyond = _scatter(residuals)
     return ResidualSummary(
         count=len(size),
         rms_px=float(np.sqrt(np.mean(size**2))) if len(size) else float("nan"),
@@ -83,7 +97,24 @@ def summarise_residuals(arrays: Mapping[str, np.ndarray], lens: CameraModel | No
         image=map_over_image(arrays["pixels"][finite], lens, residuals),
         over_angle=_curve(angle, size, angle_edges),
         over_time=_curve(seconds, size, time_edges),
+        histogram_px=(np.arange(HISTOGRAM_BINS) + 0.5) * width,
+        histogram=np.bincount(bins, minlength=HISTOGRAM_BINS).astype(np.float64),
+        scatter=scatter,
+        reach_px=reach,
+        beyond=beyond,
     )
+
+
+def _scatter(residuals: Array) -> tuple[ImageMap, float, int]:
+    """Counts of residuals (N, 2) over a square about zero that 98 % of their coordinates lie in, its half side, and
+    how many lie outside."""
+    reach = max(float(np.quantile(np.abs(residuals), 0.98)), 1e-3) if len(residuals) else 1.0
+    cell = np.floor((residuals / reach + 1) / 2 * SCATTER_CELLS).astype(np.int64)
+    inside = ((cell >= 0) & (cell < SCATTER_CELLS)).all(axis=1)
+    flat = cell[inside, 1] * SCATTER_CELLS + cell[inside, 0]
+    counts = np.bincount(flat, minlength=SCATTER_CELLS**2).astype(np.float64)
+    square = counts.reshape(SCATTER_CELLS, SCATTER_CELLS)
+    return ImageMap(SCATTER_CELLS, SCATTER_CELLS, square), reach, int((~inside).sum())
 
 
 def summarise_tracks(arrays: Mapping[str, np.ndarray], lens: CameraModel | None) -> TrackSummary:

@@ -17,6 +17,7 @@ from rigwake import __version__
 from rigwake._types import Array
 from rigwake.atomic import write_text_atomic
 from rigwake.calibration.yaml_file import plain
+from rigwake.report.adjustment_file import LandmarkCloud
 from rigwake.report.charts import Series, arrow_scale, image_map, line_chart, top_view
 from rigwake.report.content import RIG_TRAJECTORY, ReportContent, load_report_content
 from rigwake.report.extrinsics import directions, number, overview, plus_minus, time_offset, two_digits
@@ -24,9 +25,10 @@ from rigwake.report.html_page import CLOCKS_ARE_SET_NS
 from rigwake.report.lens_displacement import lens_displacements
 from rigwake.report.motion_figures import MotionFigures, motion_of, paths_in_one_world
 from rigwake.report.picture_overlays import embed_pictures, mask_uri
-from rigwake.report.report_verdict import judge
+from rigwake.report.report_verdict import judge, odd_limit_px, odd_pairs
 from rigwake.report.scene import path_scene, rig_scene
 from rigwake.report.seamless import load_seamless
+from rigwake.report.sensor_charts import sensor_charts
 from rigwake.trajectory import Trajectory
 
 
@@ -73,7 +75,9 @@ def _values(content: ReportContent) -> dict[str, Any]:
     rig = content.trajectories.get(RIG_TRAJECTORY)
     motion = motion_of(rig) if rig is not None else None
     embedded, unreadable = embed_pictures(content.pictures)
-    scenes = {"rig": rig_scene(calibration), "paths": path_scene(paths, colours)}
+    landmarks = content.adjustment.landmarks
+    scenes = {"rig": rig_scene(calibration), "paths": path_scene(paths, colours, landmarks)}
+    association = calibration.checks.get("hand_over")
     return {
         "version": __version__,
         "css": _asset("report.css"),
@@ -86,6 +90,13 @@ def _values(content: ReportContent) -> dict[str, Any]:
         "colours": colours,
         "verdict": judge(calibration),
         "rows": overview(calibration),
+        "halves": _halves(calibration.checks),
+        "odd_pairs": odd_pairs(association),
+        "odd_limit_px": _odd_limit_px(association),
+        "sensors": sensor_charts(content.adjustment),
+        "landmarks": landmarks,
+        "rig_dimensions": scenes["rig"]["dimensions"],
+        "landmarks_shown": sum(len(cloud["points"]) for cloud in scenes["paths"]["cloud"]),
         "directions": {name: directions(camera) for name, camera in calibration.cameras.items()},
         "offsets": [time_offset(camera) for camera in calibration.cameras.values()],
         "sigma_rows": _sigma_rows(content),
@@ -153,6 +164,35 @@ def _first_guess(content: ReportContent) -> dict[str, tuple[Array, Array]]:
 _SIGMA_FLOOR, _SIGMA_CEILING = 1e-4, 1.0  # degrees and metres alike: the ends of the bars
 
 
+def _odd_limit_px(association: Any) -> float:
+    median = association.get("median_px") if isinstance(association, Mapping) else None
+    return odd_limit_px(float(median)) if isinstance(median, int | float) else float("inf")
+
+
+def _halves(checks: Mapping[str, Any]) -> dict[str, list[list[tuple[str, str]]]]:
+    """Per camera and half: x, y, z (mm) and the rotation, as text and their own sigma; of older files nothing."""
+    found: dict[str, list[list[tuple[str, str]]]] = {}
+    split = plain(checks.get("split_half"))
+    for name, one in split.items() if isinstance(split, Mapping) else ():
+        halves = one.get("halves") if isinstance(one, Mapping) else None
+        if not isinstance(halves, list):
+            continue
+        for half in halves:
+            cells = [
+                (number(_metres(x), 1), plus_minus(_metres(s), "mm"))
+                for x, s in zip(half["translation_m"], half["std_translation_m"], strict=True)
+            ]
+            turn = [s for s in half["std_rotation_deg"] if isinstance(s, int | float)]
+            cells.append(("", plus_minus(max(turn), "°") if turn else "unobservable"))
+            found.setdefault(str(name), []).append(cells)
+    return found
+
+
+def _metres(value: Any) -> float:
+    """Millimetres of a number of metres; NaN where there is none."""
+    return 1e3 * float(value) if isinstance(value, int | float) else float("nan")
+
+
 def _sigma_rows(content: ReportContent) -> list[tuple[str, list[tuple[str, float | None]]]]:
     """Per camera six standard deviations as text and as the length (percent) of a logarithmic bar."""
     rows = []
@@ -171,6 +211,18 @@ def _sigma_rows(content: ReportContent) -> list[tuple[str, list[tuple[str, float
                 cells.append((text, float(np.clip(100 * span, 1, 100))))
         rows.append((name, cells))
     return rows
+
+
+def _cloud_from_above(landmarks: LandmarkCloud | None, colours: Mapping[str, int]) -> list[Series]:
+    """Landmarks by the camera that saw them first."""
+    if landmarks is None:
+        return []
+    names = np.array(landmarks.cameras)
+    points = landmarks.points_world
+    return [
+        Series(name, points[names == name, 0], points[names == name, 1], colours.get(name, 7))
+        for name in dict.fromkeys(landmarks.cameras)
+    ]
 
 
 def _charts(
@@ -209,17 +261,24 @@ def _charts(
             "points",
             [Series(n, t.per_frame_at_s, t.per_frame, colours.get(n, 0)) for n, t in tracks.items()],
         ),
+        "sizes": line_chart(
+            "Histogram of the residuals' sizes",
+            "size, px",
+            "observations",
+            [Series(n, r.histogram_px, r.histogram, colours.get(n, 0)) for n, r in residuals.items()],
+        ),
         "top": top_view(
-            "Paths seen from above",
+            "Paths and landmarks seen from above",
             [Series(n, p[:, 0], p[:, 1], colours.get(n, 7)) for n, p in reversed(list(paths.items()))],
+            cloud=_cloud_from_above(content.adjustment.landmarks, colours),
         ),
     }
     if motion is not None:
         yaw, pitch, roll = motion.yaw_pitch_roll_deg.T
         charts["yaw"] = line_chart(
-            "Heading over time",
+            "Yaw over time",
             "time, s",
-            "heading, deg",
+            "yaw, deg",
             [Series("yaw", motion.at_s, yaw, 0)],
             from_zero=False,
         )

@@ -199,7 +199,7 @@ def _association(checks: Mapping[str, Any]) -> Reason:
     words = (
         f"{count:.0f} landmarks, predicted into images not used for them, land {median:.2g} px off (median)"
     )
-    odd = _odd_pairs(association, median)
+    odd = [f"{pair} {off:.2g} px" for pair, off in odd_pairs(association).items()]
     if odd:
         return Reason(
             False,
@@ -215,15 +215,23 @@ def _association(checks: Mapping[str, Any]) -> Reason:
     )
 
 
-def _odd_pairs(association: Any, median_px: float) -> list[str]:
-    """Pairs of cameras whose landmarks land far off although all others do not: `a->b 3.1 px`."""
+def odd_limit_px(median_px: float) -> float:
+    """Beyond this a pair of cameras, or one landmark, stands out among held-out landmarks with such a median."""
+    return max(ODD_PAIR_PX, ODD_PAIR_RATIO * median_px)
+
+
+def odd_pairs(association: Any) -> dict[str, float]:
+    """By pair `a->b` the median in px, where landmarks land far off although all others do not."""
+    median = _number(association, "median_px")
     pairs = association.get("by_pair") if isinstance(association, Mapping) else None
+    if median is None or not isinstance(pairs, Mapping):
+        return {}
     found = {
         str(pair): (_number(entry, "median_px") or 0.0, _number(entry, "count") or 0)
-        for pair, entry in (pairs.items() if isinstance(pairs, Mapping) else ())
+        for pair, entry in pairs.items()
     }
-    limit_px = max(ODD_PAIR_PX, ODD_PAIR_RATIO * median_px)
-    return [f"{pair} {off:.2g} px" for pair, (off, count) in found.items() if off > limit_px and count > 1]
+    limit_px = odd_limit_px(median)
+    return {pair: off for pair, (off, count) in found.items() if off > limit_px and count > 1}
 
 
 def _between_cameras(association: Any) -> bool:

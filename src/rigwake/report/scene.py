@@ -9,6 +9,8 @@ import numpy as np
 
 from rigwake._types import Array
 from rigwake.calibration import CalibratedCamera, Calibration
+from rigwake.report.adjustment_file import LandmarkCloud
+from rigwake.report.charts import CLOUD_REACH, axis_text, ticks
 
 # the outline of a hull seen from above, bow at x = 0.5, one long
 _HALF_HULL = [(0.36, 0.1), (0.15, 0.17), (-0.2, 0.18), (-0.5, 0.15)]
@@ -33,7 +35,32 @@ def rig_scene(calibration: Calibration) -> dict[str, Any]:
         "hull": _hull(known) if calibration.reference in _FRAMES_WITH_A_BOW else None,
         "cameras": [_camera(c, extent) for c in calibration.cameras.values()],
         "antenna": None if calibration.antenna_rig is None else _rounded(calibration.antenna_rig),
+        "grid": _grid(shown.min(axis=0) - 0.2 * extent, shown.max(axis=0) + 0.2 * extent, np.zeros(3)),
+        "dimensions": _dimensions(known),
     }
+
+
+def _dimensions(points: Array) -> str:
+    """In words, the box around points (n, 3)."""
+    across = " × ".join(axis_text(float(round(x, 2))) for x in np.ptp(points, axis=0))
+    return f"{across} m (x × y × z)"
+
+
+def _grid(low: Array, high: Array, origin: Array) -> dict[str, Any]:
+    """Lines of a level grid at the lowest height of a box (3,), (3,): where they lie, and their names as seen from
+    `origin` (3,), which is where the scene's own zero lies. One step serves both axes."""
+    marks = ticks(0.0, float(np.max(high[:2] - low[:2])), 6)
+    step = marks[1] - marks[0] if len(marks) > 1 else 1.0
+    grid: dict[str, Any] = {"z": round(float(low[2]), 4), "low": [], "high": []}
+    for name, axis in (("x", 0), ("y", 1)):
+        first = np.floor((low[axis] + origin[axis]) / step)
+        last = np.ceil((high[axis] + origin[axis]) / step)
+        values = step * np.arange(first, last + 1)
+        grid[name] = [round(float(v - origin[axis]), 4) for v in values]
+        grid[f"{name}_names"] = [f"{axis_text(float(v))} m" for v in values.round(6)]
+        grid["low"].append(grid[name][0])
+        grid["high"].append(grid[name][-1])
+    return grid
 
 
 def _hull(positions: Array) -> list[list[float]]:
@@ -73,13 +100,28 @@ def _camera(camera: CalibratedCamera, extent: float) -> dict[str, Any]:
     }
 
 
-def path_scene(paths: Mapping[str, Array], colours: Mapping[str, int]) -> dict[str, Any]:
-    """Paths in the world, centred, metres."""
+def path_scene(
+    paths: Mapping[str, Array], colours: Mapping[str, int], cloud: LandmarkCloud | None = None
+) -> dict[str, Any]:
+    """Paths and landmarks in the world, centred on the paths, metres. Landmarks further away than `CLOUD_REACH` times
+    the paths' extent are left out."""
     if not paths:
-        return {"extent": 1.0, "middle": [0, 0, 0], "radius": 1.0, "paths": []}
+        return {"extent": 1.0, "middle": [0, 0, 0], "radius": 1.0, "paths": [], "cloud": [], "grid": None}
     everything = np.concatenate(list(paths.values()))
-    middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    middle = (low + high) / 2
     extent = float(max(np.ptp(everything, axis=0).max() / 2, 1.0))
+    points = np.zeros((0, 3))
+    names: list[str] = []
+    if cloud is not None:
+        reach = CLOUD_REACH * 2 * extent
+        near = np.flatnonzero(
+            ((cloud.points_world > low - reach) & (cloud.points_world < high + reach)).all(1)
+        )
+        points, names = cloud.points_world[near], [cloud.cameras[k] for k in near]
+    shown = np.concatenate([everything, points])
+    # heights of a few landmarks that lie wrong would put the grid below the world
+    floor = np.array([*shown[:, :2].min(axis=0), np.quantile(shown[:, 2], 0.02)])
     return {
         "extent": extent,
         "middle": [0, 0, 0],
@@ -88,6 +130,12 @@ def path_scene(paths: Mapping[str, Array], colours: Mapping[str, int]) -> dict[s
             {"name": n, "colour": colours.get(n, -1), "points": (p - middle).round(_PATH_DIGITS).tolist()}
             for n, p in paths.items()
         ],
+        "cloud": [
+            {"colour": colours.get(name, -1), "points": (points[chosen] - middle).round(2).tolist()}
+            for name in dict.fromkeys(names)
+            if len(chosen := np.flatnonzero(np.array(names) == name))
+        ],
+        "grid": _grid(floor - middle, shown.max(axis=0) - middle, middle),
     }
 
 

@@ -43,7 +43,7 @@ def with_learnt_receiver_errors(problem: RigProblem) -> RigProblem:
     gnss = problem.gnss
     if gnss is None or problem.imu is None or len(gnss.timestamps_ns) < _FEWEST:
         return problem
-    stamps, off = _antenna_off(problem)
+    stamps, off = antenna_off(problem)
     if len(off) < _FEWEST:
         return problem
     now = problem.antenna.errors
@@ -70,7 +70,7 @@ def white_noise(stamps: Indices, values: Array) -> Array:
     return np.asarray(MAD_TO_STD * np.median(np.abs(third), axis=0) / np.sqrt(20.0))
 
 
-def _antenna_off(problem: RigProblem) -> tuple[Indices, Array]:
+def antenna_off(problem: RigProblem) -> tuple[Indices, Array]:
     """Stamps and positions of the estimated antenna less the fixes, ENU; lasting errors are still in them."""
     gnss, antenna = problem.gnss, problem.antenna
     assert gnss is not None

@@ -132,7 +132,7 @@ def propose_searches(
         # whole landmarks are kept or left, evenly over all of them
         rank = np.random.default_rng(0).permutation(len(problem.landmarks))[searches.landmarks]
         searches = searches.take(np.sort(np.argsort(rank, kind="stable")[: options.max_searches]))
-    return _with_warps(problem, searches, options)
+    return with_warps(problem, searches, options)
 
 
 def _best_source(problem: RigProblem) -> Indices:
@@ -295,7 +295,7 @@ def _spread(landmarks: Indices, image: Indices, most: int) -> Indices:
     return np.sort(order[(place == np.minimum(middle, total - 1)) & (part < most)])
 
 
-def _with_warps(problem: RigProblem, searches: Searches, options: AssociationOptions) -> Searches:
+def with_warps(problem: RigProblem, searches: Searches, options: AssociationOptions) -> Searches:
     """Warps and bends of patches that lie in the plane through the landmark facing halfway between both viewers."""
     mapped = np.full((len(searches), 9, 2), np.nan)
     for source in range(len(problem.cameras)):

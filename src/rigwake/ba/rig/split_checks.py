@@ -23,7 +23,7 @@ from rigwake.ba.solver.rig_problem import (
     RigSolution,
     States,
 )
-from rigwake.calibration import Calibration
+from rigwake.calibration import CalibratedCamera, Calibration
 from rigwake.errors import RigwakeError
 from rigwake.evaluation.rig_errors import compare_calibrations
 from rigwake.parallel import one_blas_thread
@@ -102,7 +102,8 @@ def split_half(
 
 
 def split_half_summary(halves: tuple[Calibration, Calibration] | str) -> dict[str, Any]:
-    """For `Calibration.checks`: per camera how far the halves are apart, and in how many of their sigmas."""
+    """For `Calibration.checks`: per camera how far the halves are apart, in how many of their sigmas, and what
+    either half says by itself."""
     if isinstance(halves, str):
         return {"failed": halves}
     return {
@@ -110,9 +111,20 @@ def split_half_summary(halves: tuple[Calibration, Calibration] | str) -> dict[st
             "rotation_deg": d.rotation_deg,
             "translation_m": 1e-3 * d.translation_mm,
             "sigmas": d.sigmas,
+            "halves": [_half(half.cameras[name]) for half in halves],
         }
         for name, d in compare_calibrations(*halves).items()
         if name != halves[0].reference
+    }
+
+
+def _half(camera: CalibratedCamera) -> dict[str, Any]:
+    """Where one half alone puts a camera, metres, and its own sigmas about and along the axes of the rig."""
+    known = camera.observable_axes
+    return {
+        "translation_m": camera.rig_from_cam.translation,
+        "std_translation_m": np.where(known[3:], camera.std_translation_m, np.nan),
+        "std_rotation_deg": np.where(known[:3], camera.std_rotation_deg, np.nan),
     }
 
 
@@ -121,7 +133,7 @@ def association_errors(solution: RigSolution, unused: Observations) -> dict[str,
     problem = solution.problem
     distance = np.linalg.norm(predicted_pixels(problem, unused) - unused.pixels, axis=1)
     distance_known = np.isfinite(distance)
-    first = _first_camera(problem)
+    first = first_cameras(problem)
     names = [camera.name for camera in problem.cameras]
     pairs = {}
     for a in range(len(names)):
@@ -132,7 +144,7 @@ def association_errors(solution: RigSolution, unused: Observations) -> dict[str,
     return {**_summary(distance[distance_known]), "by_pair": pairs}
 
 
-def _first_camera(problem: RigProblem) -> np.ndarray:
+def first_cameras(problem: RigProblem) -> np.ndarray:
     """(L,) the camera that saw each landmark first."""
     observations = problem.observations
     order = np.lexsort((observations.timestamps_ns, observations.landmark_indices))

@@ -186,7 +186,8 @@ class View {
       const points = part.line || part.face || [part.dot || part.text];
       return points.reduce((sum, p) => sum + dot(p, towards), 0) / points.length;
     };
-    for (const part of parts) part.depth = part.text ? Infinity : depth(part) + (part.face ? -1e-6 : 0);
+    for (const part of parts)
+      part.depth = part.text ? 1e9 : part.behind ? -1e9 : depth(part) + (part.face ? -1e-6 : 0);
     parts.sort((a, b) => a.depth - b.depth);
     for (const part of parts) this.paint(pen, part, place);
     canvas.dataset.drawn = parts.length;
@@ -199,7 +200,7 @@ class View {
     const towards = [ce * ca, ce * sa, se], right = [-sa, ca, 0], up = [-se * ca, -se * sa, ce];
     let across = 1e-6, along = 1e-6;
     for (const part of parts)
-      for (const point of part.uncertainty ? [] : part.line || part.face || [part.dot || part.text]) {
+      for (const point of part.uncertainty ? [] : part.cloud || part.line || part.face || [part.dot || part.text]) {
         const p = add(point, times(this.scene.middle, -1));
         const shrink = distance / (distance - dot(p, towards));
         across = Math.max(across, Math.abs(dot(p, right)) * shrink);
@@ -214,12 +215,17 @@ class View {
     pen.lineWidth = part.width || 1.5;
     pen.setLineDash(part.dashed ? [5, 4] : []);
     pen.beginPath();
-    if (part.dot) {
+    if (part.cloud) {
+      for (const point of part.cloud) {
+        const [u, v] = place(point);
+        pen.fillRect(u - 0.9, v - 0.9, 1.8, 1.8);
+      }
+    } else if (part.dot) {
       pen.arc(...place(part.dot), part.radius || 3, 0, 7);
       pen.fill();
     } else if (part.text) {
       const [u, v] = place(part.text);
-      pen.font = (part.bold ? "600 " : "") + "13px system-ui, sans-serif";
+      pen.font = (part.bold ? "600 " : "") + (part.small ? "11px" : "13px") + " system-ui, sans-serif";
       pen.lineWidth = 4;
       pen.strokeStyle = colourOfBackground();
       pen.lineJoin = "round";
@@ -249,6 +255,23 @@ function axes(length, names, faint) {
   });
 }
 
+// a level grid with the metres of its lines; drawn below everything
+function gridParts(grid, faint) {
+  if (!grid) return [];
+  const [west, south] = grid.low, [east, north] = grid.high, z = grid.z, parts = [];
+  const line = (a, b) => parts.push({ line: [a, b], colour: faint, width: 0.7, alpha: 0.45, behind: true });
+  const name = (at, words) => parts.push({ text: at, words, colour: faint, small: true });
+  grid.x.forEach((x, k) => {
+    line([x, south, z], [x, north, z]);
+    name([x, south, z], grid.x_names[k]);
+  });
+  grid.y.forEach((y, k) => {
+    line([west, y, z], [east, y, z]);
+    if (k) name([west, y, z], grid.y_names[k]);
+  });
+  return parts;
+}
+
 function ellipsoid(centre, sigmaAxes, factor, colour) {
   const parts = [];
   for (const [i, j] of [[0, 1], [1, 2], [2, 0]]) {
@@ -269,7 +292,7 @@ function rigParts() {
   const rig = scenes.rig, text = colourOf(-1);
   const faint = getComputedStyle(root).getPropertyValue("--faint").trim();
   const factor = Number(document.getElementById("sigma").value);
-  const parts = axes(rig.extent * 0.35, ["x", "y", "z"], faint);
+  const parts = [...gridParts(rig.grid, faint), ...axes(rig.extent * 0.35, ["x", "y", "z"], faint)];
   if (rig.hull) {
     parts.push({ face: rig.hull, colour: faint, alpha: 0.13 });
     parts.push({ line: [...rig.hull, rig.hull[0]], colour: faint, alpha: 0.9 });
@@ -307,7 +330,14 @@ function rigParts() {
 
 function pathParts() {
   const faint = getComputedStyle(root).getPropertyValue("--faint").trim();
-  const parts = axes(scenes.paths.extent * 0.25, ["east", "north", "up"], faint);
+  const parts = [
+    ...gridParts(scenes.paths.grid, faint),
+    ...axes(scenes.paths.extent * 0.25, ["east", "north", "up"], faint),
+  ];
+  const box = document.getElementById("landmarks");
+  if (!box || box.checked)
+    for (const cloud of scenes.paths.cloud)
+      parts.push({ cloud: cloud.points, colour: colourOf(cloud.colour), alpha: 0.7, behind: true });
   for (const path of scenes.paths.paths) {
     const colour = colourOf(path.colour);
     for (let k = 0; k + 1 < path.points.length; k += 8)
@@ -330,7 +360,12 @@ if (rigCanvas) {
   });
 }
 const pathCanvas = document.getElementById("path3d");
-if (pathCanvas) views.push(new View(pathCanvas, pathParts, scenes.paths));
+if (pathCanvas) {
+  const view = new View(pathCanvas, pathParts, scenes.paths);
+  views.push(view);
+  const box = document.getElementById("landmarks");
+  if (box) box.addEventListener("change", () => view.draw());
+}
 
 // ---- paper: light, and with every view drawn, also those whose panel is hidden
 let themeOnScreen;
