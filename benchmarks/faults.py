@@ -204,6 +204,66 @@ def stuck(rows: slice) -> Callable[[Table], None]:
     return change
 
 
+def sent_again(times: int) -> Callable[[Faulty], None]:
+    """Every fix `times` times, at that rate."""
+
+    def change(stamps: NDArray[np.int64], v: Table) -> tuple:
+        step = int(np.median(np.diff(stamps))) // times
+        return (stamps[:, None] + step * np.arange(times)).reshape(-1), np.repeat(v, times, axis=0)
+
+    return lambda f: f.edit("gnss.csv", change)
+
+
+def held_fixes(times: int) -> Callable[[Table], None]:
+    """The receiver measures more seldom than it sends."""
+
+    def change(v: Table) -> None:
+        v[:] = v[np.arange(len(v)) // times * times]
+
+    return change
+
+
+def shown_again(f: Faulty) -> None:
+    """A stretch of pictures in place of that which follows."""
+    images = f.images(f.cameras[0])
+    first, count = len(images) // 3, len(images) // 8
+    for k in range(count):
+        images[first + count + k].unlink()
+        os.symlink(images[first + k].resolve(), images[first + count + k])
+
+
+def doubled(f: Faulty) -> None:
+    """Every second picture is the one before, under a new stamp."""
+    images = f.images(f.cameras[0])
+    for before, path in zip(images[::2], images[1::2], strict=False):
+        path.unlink()
+        os.symlink(before.resolve(), path)
+
+
+def still_axis(column: int) -> Callable[[Table], None]:
+    """An axis that shows nothing but noise."""
+
+    def change(v: Table) -> None:
+        v[:, column] = np.random.default_rng(4).normal(0.0, 0.02 if column > 2 else 0.002, len(v))
+
+    return change
+
+
+def jittering(seconds: float) -> Callable[[NDArray[np.int64]], NDArray[np.int64]]:
+    def change(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+        off = np.random.default_rng(5).normal(0.0, seconds, len(stamps))
+        return np.maximum.accumulate(stamps + np.round(off * 1e9).astype(np.int64) + np.arange(len(stamps)))
+
+    return change
+
+
+def offset(columns: list[int], values: list[float]) -> Callable[[Table], None]:
+    def change(v: Table) -> None:
+        v[:, columns] += values
+
+    return change
+
+
 def metre_grade(v: Table) -> None:
     """An error of 1 m that lasts 40 s, and 25 cm of white noise, rightly stated."""
     rng, n = np.random.default_rng(1), len(v)
@@ -307,6 +367,12 @@ def lagging(columns: slice, seconds: float) -> Callable[[Faulty], None]:
     return lambda f: f.edit("imu.csv", change)
 
 
+def smoothed(stamps: NDArray[np.int64], v: Table) -> None:
+    """Ten samples' mean, late by half of them."""
+    sums = np.cumsum(np.concatenate([np.repeat(v[:1], 10, axis=0), v]), axis=0)
+    v[:] = (sums[10:] - sums[:-10]) / 10
+
+
 def noisy(columns: slice, sigma: float) -> Callable[[Table], None]:
     def change(v: Table) -> None:
         v[:, columns] += np.random.default_rng(3).normal(0.0, sigma, v[:, columns].shape)
@@ -383,6 +449,36 @@ FAULTS: dict[str, tuple[str, Callable[[Faulty], None]]] = {
     "accelerometer 0.3 s behind the gyroscope": ("accelerometer", lagging(slice(3, 6), 0.3)),
     "gyroscope very noisy": ("gyroscope", imu(noisy(slice(0, 3), 0.2))),
     "accelerometer very noisy": ("accelerometer", imu(noisy(slice(3, 6), 3.0))),
+    "IMU stamps 2 % fast": ("imu", stamps_of("imu.csv", drifting(0.02))),
+    "IMU stamps twice as fast": ("imu", stamps_of("imu.csv", drifting(1.0))),
+    "IMU clock jumps by 0.15 s halfway": ("imu", stamps_of("imu.csv", jumping(0.15))),
+    "accelerometer x always zero": ("accelerometer", imu(scale([3], 0.0))),
+    "accelerometer y nothing but noise": ("accelerometer", imu(still_axis(4))),
+    "accelerometer x twice": ("accelerometer", imu(scale([3], 2.0))),
+    "accelerometer bias of 3 m/s2": ("accelerometer", imu(offset([3, 4], [2.5, 1.5]))),
+    "gyroscope x nothing but noise": ("gyroscope", imu(still_axis(0))),
+    "gyroscope z scale 10 %": ("gyroscope", imu(scale([2], 1.1))),
+    "gyroscope bias of 40 deg/s": ("gyroscope", imu(offset([0, 1, 2], [0.5, 0.1, -0.5]))),
+    "gyroscope bias of 12 deg/s": ("gyroscope", imu(offset([0, 1, 2], [0.15, 0.05, -0.15]))),
+    "GNSS heights in feet": ("gnss", gnss(scale([2], 1 / 0.3048))),
+    "GNSS heights upside down": ("gnss", gnss(scale([2], -1.0))),
+    "GNSS heights always zero": ("gnss", gnss(scale([2], 0.0))),
+    "GNSS heights jump by 2 m": ("gnss", gnss(lambda v: v.__setitem__(
+        (slice(70, None), 2), v[70:, 2] + 2.0))),
+    "GNSS fixes sent five times": ("gnss", sent_again(5)),
+    "GNSS fixes held for a second": ("gnss", gnss(held_fixes(5))),
+    "GNSS in GPS time, 18 s ahead": ("gnss", stamps_of("gnss.csv", late(18.0))),
+    "GNSS in local time, 2 h ahead": ("gnss", stamps_of("gnss.csv", late(7200.0))),
+    "GNSS in whole metres": ("gnss", gnss(lambda v: v.__setitem__(
+        (slice(None), slice(0, 2)), np.round(v[:, :2], 5)))),
+    "pictures of one camera shown again": ("camera", shown_again),
+    "pictures of one camera doubled": ("camera", doubled),
+    "stamps of one camera 20 % fast": ("camera", lambda f: f.restamp(f.cameras[0], drifting(0.2))),
+    "stamps of one camera jitter by 10 ms": ("", lambda f: f.restamp(f.cameras[0], jittering(0.01))),
+    "stamps of one camera jitter by 30 ms": ("camera", lambda f: f.restamp(f.cameras[0], jittering(0.03))),
+    "stamps of one camera in steps of 50 ms": ("", lambda f: f.restamp(
+        f.cameras[0], lambda s: s // 50_000_000 * 50_000_000)),
+    "IMU low-pass filtered over 0.1 s": ("", lambda f: f.edit("imu.csv", smoothed)),
 }  # fmt: skip
 PAIRS = (
     ("accelerometer in g", "GNSS 1 s late"),

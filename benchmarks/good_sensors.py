@@ -27,7 +27,8 @@ from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.pipeline.sensor_checks import vet_sensors
 from rigwake.pipeline.stream_selection import select
-from rigwake.plausibility.imu_samples import vet_samples, vet_turns
+from rigwake.plausibility.coarse_turns import vet_turns
+from rigwake.plausibility.imu_samples import vet_samples
 from rigwake.plausibility.values import SensorCheck
 from rigwake.simulation.scenario import build_scenario, load_scenario
 from rigwake.simulation.sensors import gauss_markov

@@ -11,9 +11,10 @@ from rigwake.errors import InputError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.plausibility import receiver_checks
+from rigwake.plausibility.coarse_turns import vet_turns
 from rigwake.plausibility.force_checks import check_forces, compare_forces
 from rigwake.plausibility.force_fit import ForceEquations
-from rigwake.plausibility.imu_samples import vet_samples, vet_turns
+from rigwake.plausibility.imu_samples import vet_samples
 from rigwake.plausibility.lens_checks import check_lenses, fit_lenses
 from rigwake.plausibility.noise_bounds import check_imu_noise
 from rigwake.plausibility.picture_checks import check_pictures

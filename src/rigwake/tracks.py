@@ -20,7 +20,7 @@ class TrackingReport:
     """What happened while tracking one camera.
 
     frames: given; of these `frames_used` were tracked, `frames_black` showed nothing, `frames_repeated` were
-    copies of the frame before, `frames_missing` could not be decoded. tracks, observations: what was found.
+    copies of a frame before, `frames_missing` could not be decoded. tracks, observations: what was found.
     frames_per_second: wall-clock speed, decoding included.
     """
 

@@ -10,14 +10,17 @@ import numpy as np
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import EstimationError, RigwakeError, UsageError
 from rigwake.pipeline.stream_selection import Selection
+from rigwake.plausibility.coarse_turns import vet_turns
 from rigwake.plausibility.force_checks import ForceVerdict, check_forces, compare_forces
 from rigwake.plausibility.force_fit import ForceFit, longest_segment
-from rigwake.plausibility.imu_samples import vet_samples, vet_turns
+from rigwake.plausibility.gyro_axes import check_axes
+from rigwake.plausibility.imu_samples import vet_samples
 from rigwake.plausibility.lens_checks import check_lenses, fit_lenses, is_off
 from rigwake.plausibility.lens_fit import LensFit
 from rigwake.plausibility.picture_checks import check_pictures
 from rigwake.plausibility.receiver_checks import vet_receiver
 from rigwake.plausibility.receiver_fit import level_path
+from rigwake.plausibility.stamp_rates import rate_of_stamps, turns_of, varies, with_rate
 from rigwake.plausibility.turn_checks import check_clocks, check_mounts, check_scale
 from rigwake.plausibility.turn_fit import TurnFit, camera_as_gyroscope, fit_turns
 from rigwake.plausibility.values import SensorCheck, disagreeing, refuse
@@ -129,7 +132,9 @@ def compare_sensors(
     fits, found = _fit_all(trajectories, imu)
     checks += found
     fits, imu, found = _scaled(trajectories, fits, imu, sound, repair)
-    checks += [*found, *check_clocks(fits), *check_mounts(fits)]
+    checks += [*found, *check_clocks(fits)]
+    # a wrong axis of the gyroscope looks like a mount of every camera that moves
+    checks += check_axes(fits) or check_mounts(fits)
     steady = {n: f for n, f in fits.items() if not _is_accused(n, checks)}
     forces = compare_forces(trajectories, imu, steady)
     checks += check_forces(forces)
@@ -188,22 +193,40 @@ def _fit_all(
         try:
             fit = fit_turns(trajectory, imu)
         except RigwakeError:
-            continue  # too short, or hardly turning: nothing to say
+            # too short, or hardly turning: nothing to say; else nothing of its turns is the gyroscope's
+            if varies(trajectory) and varies(turns_of(imu)):
+                unrelated[name] = 1.0
+            continue
         fits[name] = fit
         if fit.unexplained > _UNRELATED:
             unrelated[name] = fit.unexplained
     quantity = "part of its turns that the gyroscope does not explain"
-    if unrelated and len(unrelated) == len(fits) and len(fits) > 1:
+    if unrelated and not fits.keys() - unrelated.keys() and len(unrelated) > 1:
         worst = float(np.median(list(unrelated.values())))
         words = f"it leaves {100 * worst:.0f} % of every camera's turns unexplained, at any mounting and time offset."
         remedy = "Check that the IMU belongs to this recording, its axes, unit and stamps."
+        rates = [r for name in unrelated if (r := _rate(imu, trajectories[name])) is not None]
+        if len(rates) * 2 > len(unrelated):
+            words += f" They agree if its stamps run {1 / float(np.median(rates)):.3f} times as fast as the cameras'."
         return {}, [SensorCheck("gyroscope", False, worst, _UNRELATED, words, remedy, quantity)]
     checks = []
     for name, figure in unrelated.items():
         words = f"the gyroscope explains only {100 * (1 - figure):.0f} % of its turns, at any mounting and time offset."
+        if (rate := _rate(imu, trajectories[name])) is not None:
+            words += f" It agrees if its stamps run {rate:.3f} times as fast as the IMU's."
         remedy = "Check that its pictures belong to this recording, and their stamps."
         checks.append(SensorCheck(f"camera {name}", False, figure, _UNRELATED, words, remedy, quantity))
     return {n: f for n, f in fits.items() if n not in unrelated}, checks
+
+
+def _rate(imu: ImuStream, trajectory: Trajectory) -> float | None:
+    """Seconds of the camera per second of the IMU where that, and nothing else, makes their turns agree; else None."""
+    rate = rate_of_stamps(imu, trajectory)
+    try:
+        explained = rate is not None and fit_turns(trajectory, with_rate(imu, rate)).unexplained < 0.3
+    except RigwakeError:
+        return None
+    return rate if explained else None
 
 
 def _scaled(

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rigwake._types import Array
 from rigwake.errors import RigwakeError
-from rigwake.plausibility.force_fit import GRAVITY, ForceEquations, ForceFit, signed_permutations
+from rigwake.plausibility.force_fit import (
+    GRAVITY,
+    AxisFit,
+    ForceEquations,
+    ForceFit,
+    signed_permutations,
+)
 from rigwake.plausibility.turn_fit import TurnFit
 from rigwake.plausibility.values import SensorCheck
 from rigwake.recording import ImuStream
@@ -19,14 +25,25 @@ _KNOWN_ROTATION = np.deg2rad(2.0)
 _CLEARLY_BETTER = 0.6
 _SIGN_SIGMAS = 6.0
 _GRAVITY_TOLERANCE = 0.12
+MOST_BIAS = 1.5  # m/s^2; what the cheapest MEMS accelerometers have, uncalibrated, is below 1
+_LEAST_TOLD, _TOLD_STDS = 0.15, 4.0  # what an axis should show, m/s^2 and over what the others leave
+_LEAST_SLOPE, _MOST_SLOPE = 0.5, 1.6
+_WORTH_ASKING = 0.15  # of the accelerations: good recordings leave a tenth of that where they tell anything
+_DELAYS_S = tuple(sign * s for s in (0.05, 0.1, 0.2, 0.3, 0.4, 0.6) for sign in (1.0, -1.0))
 
 
 @dataclass(frozen=True, eq=False)
 class ForceVerdict:
-    """Of one camera: the fit as given, the best of all readings of the axes, and whether both tell anything."""
+    """Of one camera: the fit as given, the best of all readings of the axes, and every axis against the others.
+
+    delays: what is left, m/s^2, by seconds that the accelerometer is suspected to be behind the gyroscope; empty where
+    there was no need to ask.
+    """
 
     given: ForceFit
     best: ForceFit
+    axes: tuple[AxisFit, ...] = ()
+    delays: Mapping[float, float] = field(default_factory=dict)
 
 
 def compare_forces(
@@ -42,8 +59,24 @@ def compare_forces(
         except RigwakeError:
             continue
         fits = [equations.solve(axes) for axes in signed_permutations()]
-        found[name] = ForceVerdict(fits[0], min((f for f in fits if f.scale > 0), key=lambda f: f.left))
+        best = min((f for f in fits if f.scale > 0), key=lambda f: f.left)
+        alone = tuple(equations.alone(axis) for axis in range(3))
+        delays = {}
+        if min(best.left, *(axis.left for axis in alone)) > _WORTH_ASKING * best.moved:
+            delays = {s: _left(trajectories[name], _ahead(imu, s), fit) for s in _DELAYS_S}
+        found[name] = ForceVerdict(fits[0], best, alone, delays)
     return found
+
+
+def _ahead(imu: ImuStream, seconds: float) -> ImuStream:
+    """The IMU with forces that were measured so much later than its stamps say."""
+    times = (imu.timestamps_ns - imu.timestamps_ns[0]) * 1e-9
+    moved = [np.interp(times + seconds, times, imu.accel[:, k]) for k in range(3)]
+    return replace(imu, accel=np.stack(moved, axis=1))
+
+
+def _left(trajectory: Trajectory, imu: ImuStream, fit: TurnFit) -> float:
+    return ForceEquations(trajectory, imu, fit).solve(np.eye(3)).left
 
 
 def check_forces(verdicts: Mapping[str, ForceVerdict]) -> tuple[SensorCheck, ...]:
@@ -52,6 +85,8 @@ def check_forces(verdicts: Mapping[str, ForceVerdict]) -> tuple[SensorCheck, ...
     quantity = "specific force that vision does not explain, m/s^2"
     if not verdicts:
         return ()
+    if own := _of_itself(verdicts):
+        return (own,)
     if len(wrong) * 2 <= len(verdicts):
         left = float(np.median([v.given.left for v in verdicts.values()]))
         sound = SensorCheck("accelerometer", True, left, left, quantity=quantity)
@@ -84,6 +119,51 @@ def _what_is_wrong(v: ForceVerdict) -> str:
     if abs(gravity / GRAVITY - 1) > _GRAVITY_TOLERANCE and v.given.left < 0.5 * v.given.moved:
         return f"gravity comes out as {gravity:.2f} m/s^2 where it is 9.81: its scale is wrong"
     return ""
+
+
+def _of_itself(verdicts: Mapping[str, ForceVerdict]) -> SensorCheck | None:
+    """A bias, an axis or a delay that is wrong by all cameras together: it is no camera's fault."""
+    bias = np.median([v.given.bias for v in verdicts.values()], axis=0)
+    known = np.median([v.given.bias_std for v in verdicts.values()], axis=0) < 0.2 * MOST_BIAS
+    size = float(np.abs(bias[known]).max(initial=0.0))
+    if size > MOST_BIAS:
+        axes = ", ".join(f"{b:.1f}" if k else "unknown" for b, k in zip(bias, known, strict=True))
+        words = f"its bias is ({axes}) m/s^2 on x, y, z: no accelerometer errs by more than {MOST_BIAS:g}."
+        remedy = "Check its unit and the driver's conversion; replace the sensor if they are right."
+        return SensorCheck("accelerometer", False, size, MOST_BIAS, words, remedy, "bias, m/s^2")
+    for k, name in enumerate("xyz"):
+        deaf = [v.axes[k] for v in verdicts.values() if v.axes and _is_deaf(v.axes[k], v.given)]
+        if len(deaf) * 2 > len(verdicts):
+            slope = float(np.median([axis.slope for axis in deaf]))
+            words = f"its {name} axis shows {slope:.2f} of the force that its other axes and vision tell it should."
+            remedy = "Check the sensor's settings and range; replace it."
+            return SensorCheck(
+                "accelerometer", False, slope, 1.0, words, remedy, "shown by one axis over told"
+            )
+    delayed = [s for v in verdicts.values() if (s := _delay(v)) is not None]
+    if len(delayed) * 2 > len(verdicts):
+        late = float(np.median(delayed))
+        side = "late" if late > 0 else "early"
+        words = f"its samples are stamped {abs(late):g} s too {side} against the gyroscope's."
+        remedy = "Stamp gyroscope and accelerometer together, when they are read."
+        return SensorCheck("accelerometer", False, late, 0.0, words, remedy, "delay behind the gyroscope, s")
+    return None
+
+
+def _delay(v: ForceVerdict) -> float | None:
+    """The delay that makes the forces fit; None where none does."""
+    best = min(v.delays, key=lambda s: v.delays[s], default=None)
+    if best is None or v.delays[best] > _CLEARLY_BETTER * min(v.given.left, v.best.left):
+        return None
+    return best
+
+
+def _is_deaf(axis: AxisFit, given: ForceFit) -> bool:
+    """Whether an axis does not show what the two others and vision agree on."""
+    far = axis.slope < _LEAST_SLOPE or axis.slope > _MOST_SLOPE
+    told = axis.told > max(_LEAST_TOLD, _TOLD_STDS * axis.left)
+    sure = abs(axis.slope - 1) > _SIGN_SIGMAS * axis.slope_std
+    return bool(far and told and sure and axis.left < _CLEARLY_BETTER * given.left)
 
 
 def _is_reversed(v: ForceVerdict) -> bool:

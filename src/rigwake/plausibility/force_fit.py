@@ -29,6 +29,7 @@ GRAVITY = 9.80665
 _H_S = 0.5
 _BIAS_STD, _LEVER_STD = 0.3, 5.0
 _FEWEST = 16
+_MEDIAN_LENGTH = {2: 1.18, 3: 1.54}  # of vectors whose components have a standard deviation of one
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class ForceFit:
 
     axes: (3, 3) P. scale: metres per visual unit, with scale_std relative to it. gravity: (3,) m/s^2 in the visual
     world. left: root mean square of what is not explained, m/s^2. moved: that of the accelerations themselves without
-    gravity, m/s^2: what there is to explain.
+    gravity, m/s^2: what there is to explain. bias: (3,) m/s^2, as read, with bias_std of its worst known axis.
     """
 
     axes: Array
@@ -46,6 +47,19 @@ class ForceFit:
     gravity: Array
     left: float
     moved: float
+    bias: Array
+    bias_std: Array
+
+
+@dataclass(frozen=True, eq=False)
+class AxisFit:
+    """One axis of the accelerometer against the rest: what it shows of what it should (slope, 1 where it is right, with
+    slope_std), the root mean square of what it should show, and what the others leave unexplained, m/s^2."""
+
+    slope: float
+    slope_std: float
+    told: float
+    left: float
 
 
 def signed_permutations() -> tuple[Array, ...]:
@@ -84,7 +98,8 @@ class ForceEquations:
         imu_from_cam = turns.imu_from_cam
         # rotations of the IMU in the visual world: by the gyroscope, anchored to vision in the middle
         self.to_world = np.swapaxes(turned.at(centres), 1, 2)
-        self.to_world = at[1].rotation @ imu_from_cam.T @ self.to_world
+        self.world_from_imu = at[1].rotation @ imu_from_cam.T
+        self.to_world = self.world_from_imu @ self.to_world
         self.path_term = (at[0].translation - 2 * at[1].translation + at[2].translation) / _H_S**2
         self.lever_term = (at[0].rotation - 2 * at[1].rotation + at[2].rotation) / _H_S**2
         self._integrals(imu, turned.rotation, centres)
@@ -105,29 +120,60 @@ class ForceEquations:
 
     def solve(self, axes: Array) -> ForceFit:
         """The least that this reading of the axes leaves, robustly."""
-        n = len(self.force)
-        right = np.einsum("naxy,xy->na", self.force, axes).reshape(-1)
-        columns = np.zeros((n, 3, 10))
+        x, H, size, off = self._least(self._columns(), np.einsum("naxy,xy->na", self.force, axes))
+        moved = self.path_term * x[0]
+        # second differences overlap: neighbouring rows are not independent
+        stds = size * np.sqrt(2.0 * np.diag(np.linalg.inv(H)))
+        rms = float(np.sqrt(np.mean(np.minimum(off, 4 * size) ** 2) / 3))
+        reach = float(np.sqrt(np.mean(moved**2)))
+        return ForceFit(
+            axes, float(x[0]), float(stds[0] / max(abs(x[0]), 1e-12)), x[1:4], rms, reach, x[7:], stds[7:]
+        )
+
+    def alone(self, axis: int) -> AxisFit:
+        """One axis of the accelerometer against what the two others and vision say of it.
+
+        Rows are turned into the IMU's axes in the middle of each window, where every axis has its own.
+        """
+        columns = np.einsum("nax,nac->nxc", self.world_from_imu, self._columns())
+        right = np.einsum("nax,nayy->nx", self.world_from_imu, self.force)
+        others = [k for k in range(3) if k != axis]
+        x, _, size, _ = self._least(columns[:, others], right[:, others])
+        told, shown = columns[:, axis] @ x, right[:, axis]
+        told, shown = told - np.median(told), shown - np.median(shown)
+        slope, weights = 1.0, np.ones(len(told))
+        for _ in range(6):
+            square = max(float(np.sum(weights * told**2)), 1e-12)
+            slope = float(np.sum(weights * told * shown)) / square
+            off = np.abs(shown - slope * told)
+            weights = 1 / (1 + (off / max(3 * float(np.median(off)), 1e-4)) ** 2)
+        std = float(np.median(off)) * 1.48 * np.sqrt(2.0 / square)
+        return AxisFit(slope, float(std), float(np.sqrt(np.mean(told**2))), size)
+
+    def _columns(self) -> Array:
+        """(N, 3, 10) of scale, gravity, lever arm and bias, in axes of the visual world."""
+        columns = np.zeros((len(self.force), 3, 10))
         columns[:, :, 0] = self.path_term
         columns[:, :, 1:4] = -np.eye(3)
         columns[:, :, 4:7] = self.lever_term
         columns[:, :, 7:] = self.bias
-        A = columns.reshape(-1, 10)
+        return columns
+
+    def _least(self, columns: Array, right: Array) -> tuple[Array, Array, float, Array]:
+        """Unknowns (10,), their information for a residual of one, its robust size per axis, and residuals (N,)."""
+        n, axes = right.shape
+        A, b = columns.reshape(-1, 10), right.reshape(-1)
         prior = np.zeros(10)
         weights, x, size, H = np.ones(n), np.zeros(10), 0.1, np.eye(10)
         for _ in range(8):
             prior[4:7], prior[7:] = (size / _LEVER_STD) ** 2, (size / _BIAS_STD) ** 2
-            w = np.repeat(weights, 3)
+            w = np.repeat(weights, axes)
             H = (A * w[:, None]).T @ A + np.diag(prior) + 1e-12 * np.eye(10) * self.unit**2
-            x = np.linalg.solve(H, A.T @ (w * right))
-            off = np.linalg.norm((A @ x - right).reshape(-1, 3), axis=1)
-            size = max(float(np.median(off)) / 1.54, 1e-4)
+            x = np.linalg.solve(H, A.T @ (w * b))
+            off = np.linalg.norm((A @ x - b).reshape(-1, axes), axis=1)
+            size = max(float(np.median(off)) / _MEDIAN_LENGTH[axes], 1e-4)
             weights = 1 / (1 + (off / (3 * size)) ** 2)
-        moved = (self.path_term * x[0]).reshape(-1, 3)
-        # second differences overlap: neighbouring rows are not independent
-        std = size * np.sqrt(2.0 * np.linalg.inv(H)[0, 0]) / max(abs(x[0]), 1e-12)
-        rms = float(np.sqrt(np.mean(np.minimum(off, 4 * size) ** 2) / 3))
-        return ForceFit(axes, float(x[0]), float(std), x[1:4], rms, float(np.sqrt(np.mean(moved**2))))
+        return x, H, size, off
 
 
 def longest_segment(trajectory: Trajectory) -> Trajectory:

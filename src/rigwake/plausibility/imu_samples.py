@@ -1,20 +1,16 @@
-"""An IMU by itself and against a camera's coarse turns: units, axes, gravity, saturation, samples that stand still."""
+"""An IMU by itself: unit of the force, gravity, saturation, samples and axes that stand still."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigwake._types import Array
-from rigwake.errors import RigwakeError
 from rigwake.plausibility.force_fit import GRAVITY
-from rigwake.plausibility.turn_fit import fit_turns
 from rigwake.plausibility.values import SensorCheck
 from rigwake.recording import ImuStream
-from rigwake.trajectory import Trajectory
 
 _ACCEL_UNITS = {"g": GRAVITY, "milli-g": GRAVITY * 1e-3, "cm/s^2": 1e-2, "mm/s^2": 1e-3}
 _UNIT_TOLERANCE = 0.08
@@ -23,8 +19,8 @@ _HELD_RUN, _CLIPPED_RUN = 10, 3
 _DISTINCT = 50  # values of an axis
 _MOST_LOST = 0.2  # of the samples
 _LONG_GAP_S = 0.1
-_UNEXPLAINED = 0.2  # of the coarse turns; good recordings leave up to 0.1
-_CLEARLY_BETTER = 0.5
+# of one axis: so long, and so many times the usual run of equal values, which a coarse converter repeats too
+_STILL_S, _STILL_RUNS = 1.0, 30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +92,12 @@ def _lost_samples(imu: ImuStream, repair: bool) -> tuple[ImuStream, list[SensorC
             words = f"{int(clipped.sum())} samples are clipped at {limit:.3g}: its range is too small"
             checks.append(_loss(name, clipped, words, repair, "Use a larger range."))
             lost |= clipped
+        for axis, still in _still_axes(imu, signal).items():
+            words = (
+                f"axis {axis} repeats {int(still.sum())} samples to the last digit while the others change"
+            )
+            checks.append(_loss(name, still, words, repair, "Check the driver and the cable."))
+            lost |= still
     stuck = held >= _HELD_RUN
     if stuck.any():
         words = f"{int(stuck.sum())} samples repeat the one before to the last digit"
@@ -163,65 +165,28 @@ def _gaps(imu: ImuStream, repair: bool) -> tuple[ImuStream, list[SensorCheck]]:
     return imu, [SensorCheck("imu", True, longest, _LONG_GAP_S, words, "", "longest gap, s")]
 
 
-def _silence(imu: ImuStream, repair: bool) -> tuple[ImuStream, list[SensorCheck]]:
-    """A gyroscope that says nothing."""
-    spread = float(np.ptp(imu.gyro, axis=0).min()) if len(imu.gyro) else 0.0
-    if spread > 0:
-        return imu, []
-    dead = [axis for axis, size in zip("xyz", np.ptp(imu.gyro, axis=0), strict=True) if size == 0]
-    words = f"axis {', '.join(dead)} never changes."
-    return imu, [SensorCheck("gyroscope", False, 0.0, 0.0, words, "Check the driver's settings.", "range")]
-
-
-_WRONGS: dict[str, Callable[[Array], Array]] = {
-    "its unit is deg/s": np.deg2rad,
-    "its axes are left-handed (one has the wrong sign, or two are exchanged)": lambda w: w * [1.0, 1.0, -1.0],
-    "its axes are left-handed (one has the wrong sign, or two are exchanged) and its unit is deg/s": lambda w: (
-        np.deg2rad(w * [1.0, 1.0, -1.0])
-    ),
-}
-
-
-def vet_turns(imu: ImuStream, turns: Mapping[str, Trajectory], *, repair: bool = True) -> VettedImu:
-    """The gyroscope against coarse turns of every camera: unit and handedness.
-
-    turns: by camera, from images alone. Only a wrong that makes most cameras agree is held against the gyroscope; what
-    nothing explains is left for finer checks.
-    """
-    given = _unexplained(imu, turns)
-    quantity = "part of the cameras' turns that it does not explain"
-    if not given or float(np.median(list(given.values()))) <= _UNEXPLAINED:
-        return VettedImu(imu, ())
-    figure = float(np.median(list(given.values())))
-    tried = {
-        words: float(np.median(list(_unexplained(replace(imu, gyro=change(imu.gyro)), turns).values())))
-        for words, change in _WRONGS.items()
-    }
-    best = min(tried, key=lambda words: tried[words])
-    if tried[best] > _CLEARLY_BETTER * figure or tried[best] > 1.5 * _UNEXPLAINED:
-        return VettedImu(imu, ())
-    words = (
-        f"it leaves {100 * figure:.0f} % of the cameras' turns unexplained; {best}: "
-        f"then {100 * tried[best]:.0f} % are left"
-    )
-    unit_only = best == "its unit is deg/s"
-    check = SensorCheck("gyroscope", False, figure, _UNEXPLAINED, f"{words}.", "", quantity)
-    if unit_only and repair:
-        check = replace(check, hypothesis=f"{words}. Multiplied by pi / 180.", remedy="Record in rad/s.")
-        return VettedImu(replace(imu, gyro=np.deg2rad(imu.gyro)), (check.with_action("repaired"),))
-    remedy = (
-        "Record in rad/s."
-        if unit_only
-        else "Correct the IMU's axes (x, y, z right-handed, all signs as mounted)."
-    )
-    return VettedImu(imu, (replace(check, remedy=remedy),))
-
-
-def _unexplained(imu: ImuStream, turns: Mapping[str, Trajectory]) -> dict[str, float]:
+def _still_axes(imu: ImuStream, signal: Array) -> dict[str, NDArray[np.bool_]]:
+    """By name of an axis that stands still for a while, not always, although the others go on: its samples (N,)."""
     found = {}
-    for name, trajectory in turns.items():
-        try:
-            found[name] = fit_turns(trajectory, imu).unexplained
-        except RigwakeError:
-            found[name] = 1.0
+    same = np.diff(signal, axis=0) == 0
+    rate = 1e9 / max(float(np.median(np.diff(imu.timestamps_ns))), 1.0) if len(same) else 1.0
+    for axis, name in enumerate("xyz"):
+        runs = _runs(same[:, axis])
+        usual = float(np.mean(runs[runs < runs.max()])) + 1.0 if (runs < runs.max()).any() else np.inf
+        still = runs >= max(_STILL_S * rate, _STILL_RUNS * usual)
+        others = np.delete(same, axis, axis=1)[still[1:]]
+        if still.any() and not still.all() and len(others) and others.mean(axis=0).min() < 0.5:
+            found[name] = still
     return found
+
+
+def _silence(imu: ImuStream, repair: bool) -> tuple[ImuStream, list[SensorCheck]]:
+    """Axes that say nothing at all."""
+    checks = []
+    for name, signal in (("gyroscope", imu.gyro), ("accelerometer", imu.accel)):
+        spread = np.ptp(signal, axis=0) if len(signal) else np.ones(3)
+        if spread.min() == 0:
+            dead = ", ".join(axis for axis, size in zip("xyz", spread, strict=True) if size == 0)
+            words = f"axis {dead} never changes: it is {float(signal[0, int(spread.argmin())]):.3g} in every sample."
+            checks.append(SensorCheck(name, False, 0.0, 0.0, words, "Check the driver's settings.", "range"))
+    return imu, checks

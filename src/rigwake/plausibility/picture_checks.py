@@ -13,7 +13,7 @@ _MOST_REPEATED = 0.02  # of the frames
 
 
 def check_pictures(tracks: Mapping[str, Tracks]) -> tuple[SensorCheck, ...]:
-    """Cameras whose pictures repeat the one before to the last bit; such pictures were never tracked.
+    """Cameras whose pictures repeat an earlier one to the last bit; such pictures were never tracked.
 
     Where they begin is where the longest time passes between frames that were used.
     """
@@ -27,7 +27,8 @@ def check_pictures(tracks: Mapping[str, Tracks]) -> tuple[SensorCheck, ...]:
         if len(used) > 1:
             k = int(np.argmax(np.diff(used)))
             at = f", the longest from {(used[k] - used[0]) * 1e-9:.1f} s to {(used[k + 1] - used[0]) * 1e-9:.1f} s"
-        words = f"{report.frames_repeated} of {report.frames} pictures repeat the one before (frozen){at}; left out."
+        count = f"{report.frames_repeated} of {report.frames} pictures"
+        words = f"{count} repeat an earlier one (frozen, or shown again){at}; left out."
         fraction = report.frames_repeated / max(report.frames, 1)
         check = SensorCheck(
             f"camera {name}",

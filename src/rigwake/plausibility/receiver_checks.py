@@ -17,6 +17,8 @@ from rigwake.plausibility.receiver_fit import (
     fit_receiver,
     frozen_rows,
 )
+from rigwake.plausibility.receiver_repeats import never_moves, repeated_rows, without_heights
+from rigwake.plausibility.receiver_wrongs import check_heights, clock_confusion
 from rigwake.plausibility.values import SensorCheck
 from rigwake.recording import GnssStream
 from rigwake.trajectory import Trajectory
@@ -32,6 +34,7 @@ _LEAST_JUMP_M, _JUMP_STDS = 0.5, 8.0
 _FEWEST = 12
 _STANDING_S, _LEAST_WAY_M = 2.0, 0.8
 _LONGEST_STEP_S = 5.0
+_REPEATS = "Check the receiver: it repeats its last fix."
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +64,10 @@ def vet_receiver(
     """
     sensor = f"gnss {gnss.name}"
     checks: list[SensorCheck] = []
+    if (unusable := _unusable(gnss, path, time_offset_s)) is not None:
+        return VettedReceiver(None, 0.0, None, (unusable,))
+    gnss, found = _without_repeats(gnss, repair)
+    checks += found
     try:
         gnss, found = _without_frozen(gnss, path, time_offset_s, repair)
         checks += found
@@ -87,6 +94,8 @@ def vet_receiver(
         return VettedReceiver(None, 0.0, fit, (*checks, check))
     if level and (away := _running_away(gnss, path, time_offset_s, fit)) is not None:
         return VettedReceiver(None, 0.0, fit, (*checks, away))
+    if level and (heights := check_heights(gnss, path, time_offset_s, fit)) is not None:
+        return VettedReceiver(None, 0.0, fit, (*checks, heights))
     ratio = 1.0 if inertial_scale is None else fit.scale / inertial_scale[0]
     if inertial_scale is not None and abs(ratio - 1) > inertial_scale[1] + 5 * fit.scale_std:
         words = f"its distances are {ratio:.3f} times those by the accelerometer."
@@ -146,13 +155,54 @@ def _confusion(
             left[words] = fit_receiver(path, gnss, positions, time_offset_s=time_offset_s).rms
         except UnobservableError:
             continue
+    clock = clock_confusion(gnss, path, time_offset_s, given.rms)
+    if clock is not None:
+        left[clock[0]] = clock[1]
     if not left:
         return "", ""
     best = min(left, key=lambda words: left[words])
     if left[best] > _CLEARLY_BETTER * given.rms:
         return "", ""
     words = f"{best}: its fixes lie {given.rms:.2f} m off the cameras' path as recorded, {left[best]:.2f} m corrected"
+    if clock is not None and best == clock[0]:
+        return words, "Correct its stamps."
     return words, "Correct the order and signs of its coordinates."
+
+
+def _unusable(gnss: GnssStream, path: Trajectory, time_offset_s: float) -> SensorCheck | None:
+    """Fixes that are all one position, or of another time altogether."""
+    sensor, quantity = f"gnss {gnss.name}", "seconds between its fixes and the cameras' path"
+    if never_moves(gnss):
+        words = f"all its {len(gnss.position_enu)} fixes are the same to the last digit."
+        return SensorCheck(sensor, False, 1.0, 0.0, words, _REPEATS, "fraction of the fixes")
+    at = gnss.timestamps_ns - round(time_offset_s * 1e9)
+    if not len(at):
+        return None
+    apart = max(int(at[0]) - int(path.timestamps_ns[-1]), int(path.timestamps_ns[0]) - int(at[-1])) * 1e-9
+    if apart <= 0:
+        return None
+    clock = clock_confusion(gnss, path, time_offset_s, None)
+    words = (
+        f"{clock[0]}: corrected, its fixes lie {clock[1]:.2f} m off the cameras' path."
+        if clock is not None
+        else f"its stamps lie {apart:.0f} s before or after everything that the cameras saw."
+    )
+    return SensorCheck(sensor, False, apart, 0.0, words, "Correct its stamps.", quantity)
+
+
+def _without_repeats(gnss: GnssStream, repair: bool) -> tuple[GnssStream, list[SensorCheck]]:
+    """Without fixes that were sent again under a new stamp, which count once, and heights that are one number."""
+    flat = without_heights(gnss)
+    if flat is not None:
+        words = "all its heights are the same: it does not measure them; they have no weight."
+        remedy = "Set the receiver to three dimensions."
+        check = SensorCheck(f"gnss {gnss.name}", False, 0.0, 0.0, words, remedy, "range of its heights, m")
+        return (flat, [check.with_action("repaired")]) if repair else (gnss, [check])
+    repeated = repeated_rows(gnss)
+    if not repeated.any():
+        return gnss, []
+    words = f"{int(repeated.sum())} of {len(repeated)} fixes repeat the one before to the last digit"
+    return _reduced(gnss, ~repeated, words, _REPEATS, repair)
 
 
 def _without_frozen(
@@ -178,7 +228,7 @@ def _without_frozen(
         return gnss, []
     at = (gnss.timestamps_ns[int(np.argmax(frozen))] - gnss.timestamps_ns[0]) * 1e-9
     words = f"{int(frozen.sum())} fixes from {at:.1f} s on repeat the one before to the last digit"
-    return _reduced(gnss, ~frozen, words, "Check the receiver: it repeats its last fix.", repair)
+    return _reduced(gnss, ~frozen, words, _REPEATS, repair)
 
 
 def _without_standing(
@@ -204,7 +254,7 @@ def _without_standing(
     kept[fit.rows[standing]] = False
     begin = times[int(np.argmax(standing))]
     words = f"{int(standing.sum())} fixes from {begin:.1f} s on stand still while the cameras move"
-    return _reduced(gnss, kept, words, "Check the receiver: it repeats its last fix.", repair)
+    return _reduced(gnss, kept, words, _REPEATS, repair)
 
 
 def _white_noise(gnss: GnssStream) -> float:

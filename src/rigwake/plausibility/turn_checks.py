@@ -130,7 +130,7 @@ def mount_change(fit: TurnFit) -> MountChange | None:
     rotation towards the IMU. A knock is also a turn of the camera that the gyroscope did not feel: where one stride
     shows it, the same turn between both sides confirms it.
     """
-    turns, gyro, n = fit.camera_turns, _gyro_turns(fit), len(fit.camera_turns)
+    turns, gyro, n = fit.camera_turns, gyro_turns(fit), len(fit.camera_turns)
     if n < 2 * _FEWEST:
         return None
     sizes = np.linalg.norm(fit.residuals, axis=1)
@@ -177,7 +177,7 @@ def _split(fit: TurnFit, gyro: Array, k: int, skipped: int) -> MountChange:
     return MountChange(int(fit.start_ns[k]), mounts[0], mounts[1], float(np.hypot(stds[0], stds[1])))
 
 
-def _gyro_turns(fit: TurnFit) -> Array:
+def gyro_turns(fit: TurnFit) -> Array:
     """(N, 3) rotation vectors of the gyroscope over the strides, from the camera's and the residuals."""
     turned = fit.imu_from_cam @ so3.exp(fit.camera_turns) @ fit.imu_from_cam.T
     return so3.log(turned @ so3.exp(-fit.residuals))

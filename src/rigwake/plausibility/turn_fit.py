@@ -8,6 +8,7 @@ neither belongs to a sensor that works: what they come out as tells what is wron
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,13 +149,17 @@ def _minimise(strides: _Strides, imu: ImuStream, offset_s: float) -> TurnFit:
 
     turned = integrate_gyro(imu)
 
-    def gyro_turns(x: Array) -> Array:
-        """Rotation vectors: the bias over half a second is small enough to be taken off a turn as a whole."""
+    @lru_cache(8)  # most derivatives change neither
+    def integrated(lag_s: float, drift: float) -> Array:
         ends = [
-            turned.at(stamps + np.round((x[6] + x[8] * age) * 1e9).astype(np.int64))
+            turned.at(stamps + np.round((lag_s + drift * age) * 1e9).astype(np.int64))
             for stamps, age in zip((strides.start_ns, strides.end_ns), ages, strict=True)
         ]
-        turns = so3.log(np.swapaxes(ends[0], 1, 2) @ ends[1])
+        return so3.log(np.swapaxes(ends[0], 1, 2) @ ends[1])
+
+    def gyro_turns(x: Array) -> Array:
+        """Rotation vectors: the bias over half a second is small enough to be taken off a turn as a whole."""
+        turns = integrated(float(x[6]), float(x[8]))
         return np.asarray(np.exp(x[7]) * (turns - x[3:6] * seconds))
 
     def residuals(x: Array, X: Array) -> Array:

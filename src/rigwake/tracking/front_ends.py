@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from hashlib import blake2b
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -138,17 +139,19 @@ class _TrackingRun:
     seen: list[Observed] = field(default_factory=list)
     black: int = 0
     repeated: int = 0
-    last: Image | None = None
+    shown: set[bytes] = field(default_factory=set)
 
     def judge(self, image: Image) -> str:
-        """Whether a frame is `usable`, `black` or a `repeated` copy of the one before."""
-        if self.last is not None and np.array_equal(self.last, image):
-            self.repeated += 1
-            return "repeated"
-        self.last = image
-        if float(image[::4, ::4].std()) < _MIN_CONTRAST:
+        """Whether a frame is `usable`, `black` or a `repeated` copy of one before: noise makes no picture twice."""
+        coarse = np.ascontiguousarray(image[::4, ::4])
+        if float(coarse.std()) < _MIN_CONTRAST:
             self.black += 1
             return "black"
+        known = blake2b(coarse, digest_size=16).digest()
+        if known in self.shown:
+            self.repeated += 1
+            return "repeated"
+        self.shown.add(known)
         return "usable"
 
     def add(self, row: int, observed: Observed) -> None:

@@ -1,0 +1,48 @@
+"""Fixes that a receiver gives more than once, each time with a new stamp, and heights that it does not measure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigwake.recording import GnssStream
+
+_LEAST_STEP_M = 0.05  # below, a vessel that lies still or a coarse last digit repeat a position too
+_WORTH_A_WORD = 0.02  # of the fixes
+_UNKNOWN_HEIGHT_M = 100.0
+
+
+def repeated_rows(gnss: GnssStream) -> NDArray[np.bool_]:
+    """(G,) fixes that repeat the one before to the last digit although the next other one lies elsewhere.
+
+    Two fixes of a moving vessel are never alike: these are one fix, sent again. None where they are so few that chance
+    makes them.
+    """
+    p = gnss.position_enu
+    same = np.concatenate([[False], (np.diff(p, axis=0) == 0).all(axis=1)])
+    if same.mean() < _WORTH_A_WORD:
+        return np.zeros(len(p), dtype=bool)
+    other = np.flatnonzero(~same)
+    run = np.cumsum(~same) - 1
+    steps = np.append(np.linalg.norm(np.diff(p[other], axis=0), axis=1), 0.0)
+    return np.asarray(same & (steps[run] > _LEAST_STEP_M))
+
+
+def never_moves(gnss: GnssStream) -> bool:
+    """Whether all fixes are one position: no receiver's noise is that small."""
+    return len(gnss.position_enu) > 1 and not np.ptp(gnss.position_enu, axis=0).any()
+
+
+def without_heights(gnss: GnssStream) -> GnssStream | None:
+    """The fixes with heights of no weight, where all are one height although the fixes move; else None."""
+    p = gnss.position_enu
+    # one number given as degrees and metres comes out of the conversion as a height on a bowl: a plane's curvature
+    bowl = (p[:, 0] ** 2 + p[:, 1] ** 2) / (2 * 6.37e6)
+    if len(p) < 2 or np.ptp(p[:, 2] + bowl) > 1e-4 or not np.ptp(p[:, :2], axis=0).any():
+        return None
+    covariances = gnss.covariances.copy()
+    covariances[:, 2, :] = covariances[:, :, 2] = 0.0
+    covariances[:, 2, 2] = _UNKNOWN_HEIGHT_M**2
+    return replace(gnss, covariances=covariances)

@@ -1,0 +1,148 @@
+"""Faults that once passed without a word: each is named by its sensor, and what is right is not accused."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rigwake.plausibility.coarse_turns import vet_turns
+from rigwake.plausibility.force_checks import check_forces, compare_forces
+from rigwake.plausibility.gyro_axes import check_axes
+from rigwake.plausibility.imu_samples import vet_samples
+from rigwake.plausibility.receiver_checks import VettedReceiver
+from rigwake.plausibility.stamp_rates import rate_of_stamps
+from rigwake.recording import GnssStream, ImuStream
+from rigwake.tracking.front_ends import _TrackingRun
+from test_plausibility import drifting, fits, gnss, imu, paths, vetted, wrong
+
+
+def forces(change: Callable[[np.ndarray], np.ndarray]) -> str:
+    stream = replace(imu(), accel=change(imu().accel.copy()))
+    return wrong(check_forces(compare_forces(paths(), stream, fits(imu()))))["accelerometer"]
+
+
+def with_axis(values: np.ndarray, axis: int, given: np.ndarray | float) -> np.ndarray:
+    values = values.copy()
+    values[:, axis] = given
+    return values
+
+
+def noise(size: float) -> np.ndarray:
+    return np.random.default_rng(0).normal(0, size, len(imu().accel))
+
+
+@pytest.mark.parametrize("rate", [1.1, 0.5])
+def test_stamps_that_claim_a_wrong_rate_are_named_with_the_right_one(rate: float) -> None:
+    stream = replace(imu(), timestamps_ns=drifting(imu().timestamps_ns, rate - 1))
+    assert rate_of_stamps(stream, paths()["front"]) == pytest.approx(1 / rate, rel=1e-3)
+    words = wrong(vet_turns(stream, {"front": paths()["front"]}).checks)["imu"]
+    assert f"{rate:.3f} times" in words
+    assert "100.0 Hz" in words
+
+
+def test_a_bias_beyond_any_gyroscope_is_named_and_one_of_a_cheap_one_taken_off() -> None:
+    one = {"front": paths()["front"]}
+    huge = vet_turns(replace(imu(), gyro=imu().gyro + np.array([0.5, 0.1, -0.5])), one)
+    assert "41 deg/s" in wrong(huge.checks)["gyroscope"]
+    cheap = vet_turns(replace(imu(), gyro=imu().gyro + np.array([0.15, 0.05, -0.15])), one)
+    assert [check.action for check in cheap.checks] == ["repaired"]
+    assert np.abs(np.mean(cheap.imu.gyro - imu().gyro, axis=0)).max() < 0.02
+
+
+@pytest.mark.parametrize(("axis", "gain"), [(0, 0.0), (2, 1.3)])
+def test_an_axis_of_the_gyroscope_is_not_the_fault_of_every_camera(axis: int, gain: float) -> None:
+    shown = gain * imu().gyro[:, axis] + noise(0.002)
+    checks = check_axes(fits(replace(imu(), gyro=with_axis(imu().gyro, axis, shown))))
+    assert f"its {'xyz'[axis]} axis shows {gain:.2f}" in wrong(checks)["gyroscope"]
+    assert not check_axes(fits(imu()))
+    assert not check_axes(fits(imu(calm=True), paths(calm=True)))
+
+
+def test_dead_axes_are_named_and_those_that_stand_still_for_a_while_bridged() -> None:
+    dead = vet_samples(replace(imu(), accel=with_axis(imu().accel, 0, 0.0)))
+    assert "axis x never changes" in wrong(dead.checks)["accelerometer"]
+    stopped = imu().gyro.copy()
+    stopped[800:1200, 1] = stopped[800, 1]
+    still = vet_samples(replace(imu(), gyro=stopped))
+    assert any("axis y repeats" in c.hypothesis and c.action == "repaired" for c in still.checks)
+    coarse = replace(imu(), gyro=np.round(imu().gyro, 2), accel=np.round(imu().accel, 1))
+    assert not any("repeats" in c.hypothesis for c in vet_samples(coarse).checks)
+
+
+def test_an_axis_a_bias_or_a_delay_of_the_accelerometer_is_named() -> None:
+    assert "y axis shows 0.0" in forces(lambda a: with_axis(a, 1, noise(0.02)))
+    assert "y axis shows 1.9" in forces(lambda a: a * [1.0, 2.0, 1.0])
+    assert "its bias is (1.9" in forces(lambda a: a + np.array([2.0, 0.0, 0.0]))
+    assert "0.3 s too late" in forces(lambda a: np.concatenate([a[:30], a[:-30]]))
+
+
+def with_heights(change: Callable[[np.ndarray], np.ndarray]) -> VettedReceiver:
+    p = gnss().position_enu.copy()
+    p[:, 2] = change(p[:, 2])
+    return vetted(replace(gnss(), position_enu=p))
+
+
+def test_heights_in_feet_upside_down_or_not_measured() -> None:
+    for words, change in (("in feet", lambda z: z / 0.3048), ("sign is reversed", np.negative)):
+        found = with_heights(change)
+        assert found.gnss is None
+        assert words in wrong(found.checks)["gnss gnss"]
+    flat = with_heights(np.zeros_like)
+    assert [c.action for c in flat.checks if c.hypothesis] == ["repaired"]
+    assert flat.gnss is not None
+    assert flat.gnss.covariances[:, 2, 2].min() > 1000
+
+
+@pytest.mark.parametrize("times", [2, 5])
+def test_fixes_that_are_sent_again_count_once(times: int) -> None:
+    given = gnss()
+    step = int(np.median(np.diff(given.timestamps_ns))) // times
+    again = replace(
+        given,
+        timestamps_ns=(given.timestamps_ns[:, None] + step * np.arange(times)).reshape(-1),
+        position_enu=np.repeat(given.position_enu, times, axis=0),
+        covariances=np.repeat(given.covariances, times, axis=0),
+        velocity_enu=None,
+    )
+    found = vetted(again)
+    assert found.gnss is not None
+    assert set(given.timestamps_ns) >= set(found.gnss.timestamps_ns[:-times].tolist())
+    assert any("repeat the one before" in c.hypothesis and c.action == "repaired" for c in found.checks)
+
+
+def test_a_receiver_that_never_moves_is_left_out() -> None:
+    found = vetted(replace(gnss(), position_enu=np.zeros_like(gnss().position_enu)))
+    assert found.gnss is None
+    assert "the same to the last digit" in wrong(found.checks)["gnss gnss"]
+
+
+@pytest.mark.parametrize(
+    ("late_s", "words"),
+    [
+        (18.0, "GPS time was taken for UTC"),
+        (37.0, "TAI was taken for UTC"),
+        (7200.0, "(+2 h)"),
+        (3e5, "before or after"),
+    ],
+)
+def test_stamps_of_another_clock_are_named(late_s: float, words: str) -> None:
+    given: GnssStream = gnss()
+    found = vetted(replace(given, timestamps_ns=given.timestamps_ns + round(late_s * 1e9)))
+    assert found.gnss is None
+    assert words in wrong(found.checks)["gnss gnss"]
+
+
+def test_pictures_shown_again_later_are_repeated_ones() -> None:
+    run = _TrackingRun()
+    rng = np.random.default_rng(0)
+    pictures = [rng.integers(0, 255, (40, 60), dtype=np.uint8) for _ in range(4)]
+    assert [run.judge(p) for p in (*pictures, *pictures[1:3], pictures[3])] == ["usable"] * 4 + [
+        "repeated"
+    ] * 3
+
+
+def test_a_rate_is_not_looked_for_where_nothing_turns() -> None:
+    still: ImuStream = replace(imu(), gyro=imu().gyro * 1e-3)
+    path = paths()["front"]
+    assert rate_of_stamps(still, path.take(np.arange(20))) is None
