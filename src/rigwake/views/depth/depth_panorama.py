@@ -13,7 +13,7 @@ from rigwake._types import Array, Image, Mask
 from rigwake.views.attitude import LevelAttitude
 from rigwake.views.depth.epipolar import MatchedPoints, epipolar_pairs, match_pair
 from rigwake.views.depth.motion import Earlier, moved_points
-from rigwake.views.scene.segmentation import NOT_SEEN, OBSTACLE, WATER, Labels
+from rigwake.views.scene.segmentation import OBSTACLE, WATER, Labels
 from rigwake.views.strips import StripGrid
 from rigwake.views.surface import SHELL_M, WaterAndDepth
 from rigwake.views.surround_rig import SurroundRig
@@ -22,11 +22,6 @@ NONE, PLANE, MATCHED = 0, 1, 2  # sources
 _AGREE = 3.0  # standard deviations within which points of one pixel belong together
 _FILL_PX = 2  # holes between splatted points that are filled, in pixels of the strip
 _FULL_TEXTURE = 12.0  # grey levels, at which a match is as sure as it can be
-_WAVES_M = 0.15  # of the water about its plane, and of everything else that is not modelled
-_TEST_TEXTURE = 4.0  # grey levels, below which a match proves nothing about the water
-_TEST_BELOW_DEG = 0.6  # of elevation: higher up the plane is too far away
-_CLEARLY = 2.0  # standard deviations
-_UNDER_NATS, _OVER_NATS = 3.0, 1.5  # evidence of a point under and over the water
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,40 +65,6 @@ def matched_points(
     ]
     by_motion = [] if earlier is None else moved_points(images, earlier, rig, attitude, masks, nearest_m)
     return [points for points in found if points is not None] + by_motion
-
-
-def tested_by_height(
-    labels: Labels, matched: Sequence[MatchedPoints], grid: StripGrid, attitude: LevelAttitude
-) -> Labels:
-    """Labels of a level strip, corrected where matched points lie clearly under or over the water plane.
-
-    What is under it is a mirror image, or glitter: water. What is over it stands on it. The second cue, independent of
-    what things look like; nothing changes where the height above the water is unknown.
-    """
-    if not (np.isfinite(attitude.height_m) and attitude.height_m > 0) or not matched:
-        return labels
-    inverse, std, texture, _ = _splatted(matched, grid)
-    down = np.sin(-grid.elevations())[:, None]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        range_m = 1 / inverse
-        height = attitude.height_m - range_m * down
-        range_std = std * range_m**2
-        uncertainty = np.sqrt(
-            (range_std * down) ** 2
-            + (range_m * attitude.tilt_std) ** 2
-            + attitude.height_std_m**2
-            + _WAVES_M**2
-        )
-        off = np.where(np.isfinite(height) & (texture > _TEST_TEXTURE), height / uncertainty, 0.0)
-    off = cv2.medianBlur(off.astype(np.float32), 3)
-    off[np.rad2deg(grid.elevations()) > -_TEST_BELOW_DEG] = 0
-    change = np.where(off < -_CLEARLY, -_UNDER_NATS, np.where(off > _CLEARLY, _OVER_NATS, 0.0))
-    logarithm = np.log(np.maximum(labels.probability, 1e-4))
-    logarithm[OBSTACLE] += change
-    each = np.exp(logarithm - logarithm.max(axis=0))
-    probability = (each / each.sum(axis=0)).astype(np.float32)
-    classes = np.where(labels.classes == NOT_SEEN, NOT_SEEN, probability.argmax(axis=0)).astype(np.uint8)
-    return Labels(classes, probability, labels.words)
 
 
 def fuse_depth(
