@@ -24,14 +24,14 @@ _WAVES_M = 0.15  # of the water about its plane, and of everything else that is 
 _TEXTURE = 4.0  # grey levels, below which a match proves nothing about the water
 _BELOW_DEG = 0.6  # of elevation: higher up the plane is too far away
 _CLEARLY = 2.0  # standard deviations
-_UNDER_NATS, _OVER_NATS = 4.0, 2.5  # the most that points under and over the water say
-_UNMATCHED_NATS = 1.5  # the most that textured places say which two cameras see and do not match
+_UNDER_NATS, _OVER_NATS = 3.0, 2.5  # the most that points under and over the water say
+_UNMATCHED_NATS = 1.0  # the most that textured places say which two cameras see and do not match
 _AROUND_PX = 1.4  # standard deviation of the window
 _FEW = 1.0  # points per pixel that say as much as nothing
 _STANDS = 0.35  # balance from which a pixel stands on what is under it
 _LEAST_PX = 8  # of a thing on the water
 _SURE, _POSSIBLE = 1.0, -1.6  # nats by looks alone, mean over a thing: without and with support by height
-_SUPPORTED = 0.5  # share of a thing's pixels
+_SUPPORTED, _SUPPORTED_PX = 0.25, 4  # share of a thing's pixels that stand, and their least number
 _SOLID = 0.35  # share of what was tried that must be matched over the plane or in it
 _LARGE_PX = 40  # smaller things are often not matched
 
@@ -153,7 +153,7 @@ def without_ghosts(labels: Labels, looks: Labels, evidence: PlaneEvidence, grid:
     rises = total(obstacle & far) > 0
     over, near, tried = total(evidence.over), total(evidence.near), total(evidence.tried)
     unmatched = (area >= _LARGE_PX) & (tried > area) & (over + near < _SOLID * tried)
-    supported = total(evidence.standing()) > _SUPPORTED * area
+    supported = total(evidence.standing()) > np.maximum(_SUPPORTED * area, _SUPPORTED_PX)
     mean_odds = total(odds) / area
     likely = (mean_odds > _SURE) & ~unmatched | (mean_odds > _POSSIBLE) & supported
     ghost = ~rises & ((area < _LEAST_PX) | ~likely)
