@@ -136,6 +136,20 @@ def test_ranges_of_two_cameras(seen) -> None:  # type: ignore[no-untyped-def]
     assert len(cloud) > 19 * on_wall.sum()
 
 
+def test_the_nearer_of_two_groups_counts_and_jumps_are_not_trusted() -> None:
+    stand = attitude()
+    near, far = patch(60, 74, 8.0), patch(60, 74, 20.0)
+    half = np.arange(len(far.texture)) % 60 >= 30
+    background = MatchedPoints(far.points_level[half], far.inverse_std[half], far.texture[half], ("c", "d"))
+    left = MatchedPoints(near.points_level[~half], near.inverse_std[~half], near.texture[~half], ("a", "b"))
+    behind = MatchedPoints(far.points_level[~half], far.inverse_std[~half], far.texture[~half], ("e", "f"))
+    depth = fuse_depth([left, behind, background], ring_labels(), GRID, stand)
+    distance = depth.range_m * np.cos(GRID.elevations())[:, None]
+    assert np.allclose(distance[62:72, 205:225], 8.0, rtol=0.01)  # both were matched there
+    assert np.allclose(distance[62:72, 235:255], 20.0, rtol=0.01)
+    assert depth.confidence[66, 229:231].max() < 0.5 * depth.confidence[66, 210:220].min()
+
+
 def test_one_camera_that_moves_shows_ranges(seen) -> None:  # type: ignore[no-untyped-def]
     rig, stand, images, _ = seen
     step_level = np.array([0.9, 0.2, 0.0])
