@@ -32,8 +32,8 @@ from rigwake.views.depth.depth_panorama import (
     DepthPanorama,
     fuse_depth,
     matched_points,
-    tested_by_height,
 )
+from rigwake.views.depth.height_check import tested_by_height
 from rigwake.views.depth.motion import Earlier
 from rigwake.views.height import estimate_height
 from rigwake.views.scene.label_measures import LabelComparison, flat_horizon

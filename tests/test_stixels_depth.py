@@ -9,7 +9,7 @@ from rigwake.errors import UsageError
 from rigwake.geometry.se3 import SE3
 from rigwake.trajectory import Trajectory
 from rigwake.views.attitude import LevelAttitude, track_from_trajectory
-from rigwake.views.depth import depth_panorama
+from rigwake.views.depth import height_check
 from rigwake.views.depth.depth_files import point_cloud
 from rigwake.views.depth.depth_panorama import MATCHED, PLANE, fuse_depth, matched_points
 from rigwake.views.depth.epipolar import MatchedPoints, epipolar_pairs
@@ -136,6 +136,20 @@ def test_ranges_of_two_cameras(seen) -> None:  # type: ignore[no-untyped-def]
     assert len(cloud) > 19 * on_wall.sum()
 
 
+def test_the_nearer_of_two_groups_counts_and_jumps_are_not_trusted() -> None:
+    stand = attitude()
+    near, far = patch(60, 74, 8.0), patch(60, 74, 20.0)
+    half = np.arange(len(far.texture)) % 60 >= 30
+    background = MatchedPoints(far.points_level[half], far.inverse_std[half], far.texture[half], ("c", "d"))
+    left = MatchedPoints(near.points_level[~half], near.inverse_std[~half], near.texture[~half], ("a", "b"))
+    behind = MatchedPoints(far.points_level[~half], far.inverse_std[~half], far.texture[~half], ("e", "f"))
+    depth = fuse_depth([left, behind, background], ring_labels(), GRID, stand)
+    distance = depth.range_m * np.cos(GRID.elevations())[:, None]
+    assert np.allclose(distance[62:72, 205:225], 8.0, rtol=0.01)  # both were matched there
+    assert np.allclose(distance[62:72, 235:255], 20.0, rtol=0.01)
+    assert depth.confidence[66, 229:231].max() < 0.5 * depth.confidence[66, 210:220].min()
+
+
 def test_one_camera_that_moves_shows_ranges(seen) -> None:  # type: ignore[no-untyped-def]
     rig, stand, images, _ = seen
     step_level = np.array([0.9, 0.2, 0.0])
@@ -176,25 +190,52 @@ def test_water_is_never_matched(seen) -> None:  # type: ignore[no-untyped-def]
     assert np.isnan(fuse_depth(matched, ring_labels(), GRID, nobody_knows).range_m[water]).all()
 
 
-def test_what_lies_under_the_water_is_a_mirror_image() -> None:
-    stand = attitude()
+def patch(first: int, last: int, distance_m: float) -> MatchedPoints:
+    """Rows of an upright thing, 60 columns wide, as two cameras match it."""
+    rows = np.repeat(np.arange(first, last), 60)
+    columns = np.tile(np.arange(200, 260), last - first)
+    directions = GRID.directions()[rows, columns]
+    points = directions * (distance_m / np.cos(GRID.elevations()[rows]))[:, None]
+    points = np.concatenate([points, points])
+    return MatchedPoints(points, np.full(len(points), 1e-3), np.full(len(points), 20.0), ("a", "b"))
+
+
+def labels_with(wrong: int, first: int, last: int) -> Labels:
     labels = ring_labels(0.7)
-    row, columns = 100, np.arange(200, 260)  # 10 degrees down: water at 10.7 m
-    elevation = GRID.elevations()[row]
-    for range_m, wrong, right in ((30.0, 1, 0), (5.0, 0, 1)):
-        labels.classes[row - 2 : row + 3, 200:260] = wrong
-        labels.probability[:, row - 2 : row + 3, 200:260] = np.roll(
-            np.array([0.6, 0.2, 0.2], np.float32), wrong
-        )[:, None, None]
-        directions = np.concatenate([GRID.directions()[r, columns] for r in range(row - 2, row + 3)])
-        count = len(directions)
-        points = MatchedPoints(range_m * directions, np.full(count, 1e-3), np.full(count, 20.0), ("a", "b"))
-        corrected = depth_panorama.tested_by_height(labels, [points], GRID, stand)
-        assert (corrected.classes[row, 205:255] == right).all(), (
-            f"{np.rad2deg(elevation):.0f} deg, {range_m} m"
-        )
-    untouched = depth_panorama.tested_by_height(labels, [points], GRID, LevelAttitude(stand.level_from_rig))
-    assert untouched is labels
+    labels.classes[first:last, 200:260] = wrong
+    labels.probability[:, first:last, 200:260] = np.roll(np.array([0.6, 0.2, 0.2], np.float32), wrong)[
+        :, None, None
+    ]
+    return labels
+
+
+def test_what_lies_under_the_water_is_a_mirror_image() -> None:
+    stand = attitude()  # 10 degrees down the water is 10.7 m away
+    labels = labels_with(1, 98, 103)
+    corrected = height_check.tested_by_height(labels, [patch(98, 103, 30.0)], GRID, stand)
+    assert (corrected.classes[100, 205:255] == 0).all()
+    unknown = LevelAttitude(stand.level_from_rig)
+    assert height_check.tested_by_height(labels, [patch(98, 103, 30.0)], GRID, unknown) is labels
+
+
+def test_what_reaches_down_to_the_water_stands_and_what_floats_is_chance() -> None:
+    stand, distance = attitude(), 5.0
+    foot = round(float((GRID.top_deg + np.rad2deg(np.arctan(HEIGHT_M / distance))) / GRID.step_deg))
+    labels = labels_with(0, 98, foot)
+    standing = height_check.tested_by_height(labels, [patch(98, foot, distance)], GRID, stand)
+    assert (standing.classes[100:110, 205:255] == 1).all()
+    floating = height_check.tested_by_height(labels, [patch(98, 103, distance)], GRID, stand)
+    assert (floating.classes[98:103, 205:255] == 0).all()
+
+
+def test_small_and_unsupported_pieces_on_the_water_are_ghosts() -> None:
+    stand = attitude()
+    labels = labels_with(1, 130, 132)
+    labels.classes[130:132, 203:260] = 0
+    labels.probability[:, 130:132, 203:260] = np.array([0.7, 0.2, 0.1], np.float32)[:, None, None]
+    wall = patch(80, 86, RADIUS_M)
+    assert (labels.classes[130:132, 200:203] == 1).all()
+    assert (height_check.tested_by_height(labels, [wall], GRID, stand).classes[130:132, 200:203] == 0).all()
 
 
 def test_without_a_height_there_are_no_stixels() -> None:

@@ -18,8 +18,8 @@ from rigwake.views.depth.depth_panorama import (
     DepthPanorama,
     fuse_depth,
     matched_points,
-    tested_by_height,
 )
+from rigwake.views.depth.height_check import tested_by_height
 from rigwake.views.frames import frame_sets
 from rigwake.views.prepare import SurroundOptions, prepare_surround
 from rigwake.views.scene.network import shipped_network

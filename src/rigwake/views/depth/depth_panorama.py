@@ -13,20 +13,19 @@ from rigwake._types import Array, Image, Mask
 from rigwake.views.attitude import LevelAttitude
 from rigwake.views.depth.epipolar import MatchedPoints, epipolar_pairs, match_pair
 from rigwake.views.depth.motion import Earlier, moved_points
-from rigwake.views.scene.segmentation import NOT_SEEN, OBSTACLE, WATER, Labels
+from rigwake.views.scene.segmentation import OBSTACLE, WATER, Labels
 from rigwake.views.strips import StripGrid
 from rigwake.views.surface import SHELL_M, WaterAndDepth
 from rigwake.views.surround_rig import SurroundRig
 
 NONE, PLANE, MATCHED = 0, 1, 2  # sources
 _AGREE = 3.0  # standard deviations within which points of one pixel belong together
+_NEARER = 0.75  # of the weight of a pixel's points lies farther than the group that counts
 _FILL_PX = 2  # holes between splatted points that are filled, in pixels of the strip
+_SPREAD_PX = 5  # window in which ranges are compared
+_STEP = 4.0  # how much a jump of the range within it takes off the confidence
+_NEAREST_INVERSE = 10.0  # 1/m, nearer than anything
 _FULL_TEXTURE = 12.0  # grey levels, at which a match is as sure as it can be
-_WAVES_M = 0.15  # of the water about its plane, and of everything else that is not modelled
-_TEST_TEXTURE = 4.0  # grey levels, below which a match proves nothing about the water
-_TEST_BELOW_DEG = 0.6  # of elevation: higher up the plane is too far away
-_CLEARLY = 2.0  # standard deviations
-_UNDER_NATS, _OVER_NATS = 3.0, 1.5  # evidence of a point under and over the water
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,40 +71,6 @@ def matched_points(
     return [points for points in found if points is not None] + by_motion
 
 
-def tested_by_height(
-    labels: Labels, matched: Sequence[MatchedPoints], grid: StripGrid, attitude: LevelAttitude
-) -> Labels:
-    """Labels of a level strip, corrected where matched points lie clearly under or over the water plane.
-
-    What is under it is a mirror image, or glitter: water. What is over it stands on it. The second cue, independent of
-    what things look like; nothing changes where the height above the water is unknown.
-    """
-    if not (np.isfinite(attitude.height_m) and attitude.height_m > 0) or not matched:
-        return labels
-    inverse, std, texture, _ = _splatted(matched, grid)
-    down = np.sin(-grid.elevations())[:, None]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        range_m = 1 / inverse
-        height = attitude.height_m - range_m * down
-        range_std = std * range_m**2
-        uncertainty = np.sqrt(
-            (range_std * down) ** 2
-            + (range_m * attitude.tilt_std) ** 2
-            + attitude.height_std_m**2
-            + _WAVES_M**2
-        )
-        off = np.where(np.isfinite(height) & (texture > _TEST_TEXTURE), height / uncertainty, 0.0)
-    off = cv2.medianBlur(off.astype(np.float32), 3)
-    off[np.rad2deg(grid.elevations()) > -_TEST_BELOW_DEG] = 0
-    change = np.where(off < -_CLEARLY, -_UNDER_NATS, np.where(off > _CLEARLY, _OVER_NATS, 0.0))
-    logarithm = np.log(np.maximum(labels.probability, 1e-4))
-    logarithm[OBSTACLE] += change
-    each = np.exp(logarithm - logarithm.max(axis=0))
-    probability = (each / each.sum(axis=0)).astype(np.float32)
-    classes = np.where(labels.classes == NOT_SEEN, NOT_SEEN, probability.argmax(axis=0)).astype(np.uint8)
-    return Labels(classes, probability, labels.words)
-
-
 def fuse_depth(
     matched: Sequence[MatchedPoints],
     labels: Labels,
@@ -128,8 +93,9 @@ def fuse_depth(
     range_m[known] = 1 / inverse[known]
     sigma_m[known] = std[known] / inverse[known] ** 2
     relative = sigma_m[known] / range_m[known]
-    sure = np.clip(texture[known] / _FULL_TEXTURE, 0.05, 1) * np.where(hits[known] > 0, 1.0, 0.6)
-    confidence[known] = sure * np.exp(-2 * relative) * labels.probability[1][known]
+    sure = np.clip(texture[known] / _FULL_TEXTURE, 0.3, 1) * np.where(hits[known] > 0, 1.0, 0.6)
+    step = _spread(inverse, known)[known] / inverse[known]
+    confidence[known] = sure * np.exp(-2 * relative - _STEP * step)
     source[known] = MATCHED
     down = -np.sin(grid.elevations())
     if np.isfinite(attitude.height_m) and attitude.height_m > 0:
@@ -159,12 +125,10 @@ def _splatted(matched: Sequence[MatchedPoints], grid: StripGrid) -> tuple[Array,
         inside = (at[:, 1] >= 0) & (at[:, 1] < grid.rows)
         pixel = (at[:, 1] * grid.columns + at[:, 0] % grid.columns)[inside]
         value, deviation, contrast = 1 / distance[inside], deviation[inside], contrast[inside]
-        # the texture weighs: a foreground that bleeds over an edge has little of it there
         weight = contrast / deviation**2
-        total = np.bincount(pixel, weight, size)
         with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.bincount(pixel, weight * value, size) / total
-            near = np.abs(value - mean[pixel]) < _AGREE * deviation
+            nearer = _weighted_quantile(value, contrast / deviation, pixel, size)
+            near = np.abs(value - nearer[pixel]) < _AGREE * deviation
             total = np.bincount(pixel[near], weight[near], size)
             inverse = np.bincount(pixel[near], (weight * value)[near], size) / total
             std = np.bincount(pixel[near], (weight * deviation)[near], size) / total
@@ -177,6 +141,25 @@ def _splatted(matched: Sequence[MatchedPoints], grid: StripGrid) -> tuple[Array,
         np.nan_to_num(texture).reshape(shape),
         hits.reshape(shape),
     )
+
+
+def _weighted_quantile(value: Array, weight: Array, pixel: NDArray[np.int64], size: int) -> Array:
+    """(size,) of the values (N,) in each pixel, the one that so much of the weight does not exceed; the nearer of two
+    groups has the larger values."""
+    order = np.lexsort((value, pixel))
+    total = np.concatenate([[0.0], np.cumsum(weight[order])])
+    ends = np.searchsorted(pixel[order], np.arange(size + 1))
+    wanted = total[ends[:-1]] + _NEARER * np.diff(total[ends])
+    chosen = np.clip(np.searchsorted(total[1:], wanted), 0, max(len(value) - 1, 0))
+    return np.where(np.diff(ends) > 0, value[order][chosen], np.nan)
+
+
+def _spread(inverse: Array, known: NDArray[np.bool_]) -> Array:
+    """(rows, columns) largest less least of the known values around: large where one range ends and the next begins,
+    where most wrong matches are."""
+    window = np.ones((_SPREAD_PX, _SPREAD_PX), np.uint8)
+    most = cv2.dilate(np.where(known, inverse, 0.0), window)
+    return np.asarray(most - cv2.erode(np.where(known, inverse, _NEAREST_INVERSE), window))
 
 
 def _filled(

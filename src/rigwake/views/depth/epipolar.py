@@ -9,7 +9,7 @@ small angles and a disparity of d pixels of step s that is `Z = T f / d` with `f
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import cv2
@@ -35,12 +35,15 @@ _FAR_OUTSIDE = -1e6
 @dataclass(frozen=True, eq=False)
 class MatchedPoints:
     """points_level: (N, 3) from the viewpoint, metres. inverse_std: (N,) standard deviation of the inverse range from
-    the first camera, 1/m. texture: (N,) grey levels. names: the two cameras."""
+    the first camera, 1/m. texture: (N,) grey levels. names: the two cameras. tried_level: (M, 3) places on the water
+    plane that both cameras look at and that have texture (every second pixel): whatever stands there would be matched.
+    """
 
     points_level: Array
     inverse_std: Array
     texture: Array
     names: tuple[str, str]
+    tried_level: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +135,28 @@ def match_pair(
     good &= (inverse > 1e-4) & (theta + gamma < np.pi - 0.1)
     std = _DISPARITY_STD_PX * _STEP / (pair.baseline_m * np.sin(np.clip(theta + gamma, 0.1, np.pi - 0.1)))
     points = pair.origin_level + pair.directions[good] / inverse[good][:, None]
-    return MatchedPoints(points, std[good], texture[good].astype(np.float64), names)
+    tried = _tried(pair, seen_left & (texture > _LEAST_TEXTURE), seen_right, attitude.height_m)
+    return MatchedPoints(points, std[good], texture[good].astype(np.float64), names, tried)
+
+
+def _tried(
+    pair: EpipolarPair, clear: NDArray[np.bool_], seen_right: NDArray[np.bool_], height_m: float
+) -> Array:
+    """(M, 3) places on the water plane that `clear` pixels of the first camera look at and the second sees too."""
+    directions, theta, clear = pair.directions[::2, ::2], pair.theta[None, ::2], clear[::2, ::2]
+    height = height_m + pair.origin_level[2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        range_m = np.where(directions[..., 2] < 0, height / -directions[..., 2], np.nan)
+        # of the triangle of the two cameras and the place: the parallax
+        gamma = np.arctan2(pair.baseline_m * np.sin(theta), range_m - pair.baseline_m * np.cos(theta))
+    partner = np.arange(0, seen_right.shape[1], 2)[None, :] - gamma / _STEP
+    inside = clear & (partner >= 0) & (partner < seen_right.shape[1])
+    rows, columns = np.nonzero(inside)
+    there = seen_right[
+        2 * rows, np.round(partner[rows, columns]).astype(np.int64).clip(0, seen_right.shape[1] - 1)
+    ]
+    rows, columns = rows[there], columns[there]
+    return np.asarray(pair.origin_level + directions[rows, columns] * range_m[rows, columns, None])
 
 
 def _rectified(

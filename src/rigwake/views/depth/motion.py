@@ -2,7 +2,7 @@
 
 The pair is matched like that of two cameras (`epipolar`), with the way the camera went as baseline. What moves by
 itself has a wrong range, which shows as a disagreement with the water plane or with other pairs; mirror images lie
-under the plane, which tells them from what stands on it (`depth_panorama.tested_by_height`).
+under the plane, which tells them from what stands on it (`height_check.tested_by_height`).
 """
 
 from __future__ import annotations

@@ -10,7 +10,8 @@ import numpy as np
 
 from rigwake._types import Array, Image, Mask
 from rigwake.views.attitude import LevelAttitude
-from rigwake.views.depth.depth_panorama import fuse_depth, matched_points, tested_by_height
+from rigwake.views.depth.depth_panorama import fuse_depth, matched_points
+from rigwake.views.depth.height_check import tested_by_height
 from rigwake.views.depth.motion import Earlier
 from rigwake.views.scene.network import shipped_network
 from rigwake.views.scene.segmentation import (

@@ -33,6 +33,8 @@ _AROUND_ROWS = 11
 _CORRELATED = (
     3.0  # matches in one window share their error: the cut counts them as so many times less certain
 )
+_MEDIAN_STD = 0.5  # of the median of several matches of several pairs, in deviations of one
+_SHAPE_STD = 0.008  # of a range: what stands in a column is not flat and upright
 _FOOT_ROWS = 6  # matches so far up from the foot give the range: banks and boats lean away higher up
 _APART = (
     2.5  # standard deviations between contact and match, beyond which their difference is the uncertainty
@@ -277,7 +279,8 @@ def _ranges(
         some = np.isfinite(values).any(axis=1)
         matched[some] = np.nanmedian(values[some], axis=1)
         scatter = np.nanmax(np.abs(values[some] - matched[some, None]), axis=1) / 2
-        w_match[some] = 1 / (np.square(np.nanmedian(deviations[some], axis=1)) + np.square(scatter))
+        one = np.hypot(np.nanmedian(deviations[some], axis=1), scatter)
+        w_match[some] = 1 / (np.square(_MEDIAN_STD * one) + np.square(_SHAPE_STD * matched[some]))
     total = w_foot + w_match
     with np.errstate(invalid="ignore", divide="ignore"):
         inverse = np.where(
