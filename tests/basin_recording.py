@@ -1,6 +1,6 @@
 """A small recording with pictures in seconds: the demo's boat in a basin whose round wall carries a random texture.
 
-Two fisheyes of 320 x 240 at 5 Hz with time offsets, an IMU and GNSS; no water, no own boat in view. Everything but the
+Two fisheyes of 320 x 240 at 4 Hz with time offsets, an IMU and GNSS; no water, no own boat in view. Everything but the
 pictures is the simulator's.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 import cv2
@@ -39,7 +39,7 @@ OFFSETS_MS = {"front": 24.0, "left": -17.0}
 _WALL_M, _HEIGHT_M = 24.0, 40.0  # radius of the wall about the boat's circuit, height that the texture spans
 
 
-def basin(seconds: float = 16.0, rate_hz: float = 5.0) -> Simulation:
+def basin(seconds: float = 16.0, rate_hz: float = 4.0) -> Simulation:
     """The demo's motion with two small cameras whose clocks are off."""
     document = load_scenario("demo").model_dump()
     document["duration_s"] = seconds
@@ -51,6 +51,13 @@ def basin(seconds: float = 16.0, rate_hz: float = 5.0) -> Simulation:
         if c["name"] in OFFSETS_MS
     ]
     return prepare(build_scenario(document, "basin"))
+
+
+@cache
+def _wall() -> NDArray[np.float32]:
+    """The texture, with its first columns once more at its end."""
+    texture = random_texture(0)
+    return np.concatenate([texture, texture[:, :2]], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +89,12 @@ class BasinPictures:
         b = ray[:, :2] @ origin[:2]
         reach = (-b + np.sqrt(b * b - a * (origin[:2] @ origin[:2] - _WALL_M**2))) / a
         point = origin + ray * reach[:, None]
-        texture = random_texture(0)
-        rows, columns = texture.shape
+        texture = _wall()
+        rows, columns = texture.shape[0], texture.shape[1] - 2
         column = np.arctan2(point[:, 1], point[:, 0]) / (2 * np.pi) * columns % columns
         row = np.clip(0.5 + point[:, 2] / _HEIGHT_M, 0, 1) * (rows - 1)
         seen = cv2.remap(
-            np.concatenate([texture, texture[:, :2]], axis=1),
+            texture,
             column.reshape(SIZE[::-1]).astype(np.float32),
             row.reshape(SIZE[::-1]).astype(np.float32),
             cv2.INTER_LINEAR,

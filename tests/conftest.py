@@ -6,6 +6,9 @@ import os
 from pathlib import Path
 from typing import Any
 
+# one worker per core runs already: more threads would only wait for each other, also in processes that tests start
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import pytest
 from hypothesis import HealthCheck, settings
 

@@ -128,7 +128,7 @@ USED = [
     ("diff {calibration} {calibration} --range 10 --range 50 --json {here}/d.json", 0, "at 50 m"),
     ("diff {calibration} {open}", 0, "next:"),
     ("diff {calibration} {open} --html {here}/diff.html", 0, "next:"),
-    ("handeye {rig_tum} {port_tum} -o {here}/h12.yaml --html {here}/handeye.html", 0, "mountings determined"),
+    ("handeye {rig_tum} {port_tum} -o {here}/h12.yaml --html {here}/handeye.html", 0, "mountings observable"),
     ("intrinsics {images} --from-motion --fov 85", 3, "3.0 s of images"),
     ("intrinsics {corners} --image-size 640x480 --fov front=90", 2, "one --fov holds for every lens"),
     ("intrinsics {corners} --image-size 640x480 --model kb4 --html {here}/lens.html", 0, "written:"),

@@ -74,7 +74,7 @@ def test_alignment_removes_the_motion_of_the_whole_rig() -> None:
         assert e.nees is None
 
 
-def test_an_undetermined_axis_has_no_error_and_does_not_count() -> None:
+def test_an_unobservable_axis_has_no_error_and_does_not_count() -> None:
     lost = UnobservableDirection(np.eye(6)[5], "vertical offset of front")
     found = calibration()
     cameras = {**found.cameras, "front": replace(found.cameras["front"], unobservable=(lost,))}
@@ -162,7 +162,7 @@ def test_tables_fit_a_terminal_of_80_columns(
     rows = [line.split() for line in shown if line.startswith(("port", "front", "aft"))]
     assert {row[0] for row in rows} == {"front", "port", "aft"}
     assert len(rows) == 5 * 3  # evaluate, two tables of diff, two of calibrate: one line per camera each
-    assert "undetermined" in "".join(shown)
+    assert "unobservable" in "".join(shown)
     assert "nan" not in "".join(shown)
 
 

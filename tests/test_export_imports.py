@@ -105,7 +105,7 @@ def test_cameras_of_kalibrs_own_files_are_named_by_their_topics(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", HOLD_NO_NULL)
-def test_undetermined_cameras_are_refused_or_left_out(tmp_path: Path, name: str) -> None:
+def test_unobservable_cameras_are_refused_or_left_out(tmp_path: Path, name: str) -> None:
     rig = without_vertical(boat(), "port")
     if name == "mrcal":
         rig = without_vertical(boat(lens=PINHOLE), "port")

@@ -38,6 +38,18 @@ def test_processes_that_compile_at_once_do_not_mix_up_their_code(tmp_path: Path)
     assert files.load("integers") == "code for integers"
 
 
+def test_code_of_former_sources_is_removed(tmp_path: Path) -> None:
+    """The file's stamp tells former sources, the line in its name where the kernel stood."""
+    for name, stamp in (("kernel-10.py311", "old"), ("kernel-12.py311", "old"), ("other-14.py311", "old")):
+        KernelFile(str(tmp_path), name, stamp).save("floats", f"{name} {stamp}")
+    new = KernelFile(str(tmp_path), "kernel-12.py311", "new")
+    new.save("floats", "new code")
+    new.save("integers", "more code")
+    assert sorted(path.name.split(".")[0] for path in tmp_path.glob("*.nbi")) == ["kernel-12", "other-14"]
+    assert len(list(tmp_path.glob("kernel-*.nbc"))) == 2
+    assert (new.load("floats"), new.load("integers")) == ("new code", "more code")
+
+
 def test_one_file_for_each_set_of_argument_types_of_a_kernel() -> None:
     @njit()
     def doubled(value: Any) -> Any:

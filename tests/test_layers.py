@@ -3,8 +3,6 @@
 import ast
 from pathlib import Path
 
-import pytest
-
 PACKAGE = Path(__file__).parent.parent / "src" / "rigwake"
 
 # left to right; a module may import from its own layer or from any layer further left
@@ -81,9 +79,13 @@ MODULES = sorted(
 )
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_point_left(path: Path) -> None:
-    layer = layer_of(list(path.relative_to(PACKAGE).with_suffix("").parts))
-    assert layer in RANK, f"{layer} is not in the list of layers: say where it stands in the way of the data"
-    wrong = {other for other in imported_layers(path) if RANK[other] > RANK[layer]}
-    assert not wrong, f"{layer} imports from its right: {sorted(wrong)}"
+def test_imports_point_left() -> None:
+    wrong = []
+    for path in MODULES:
+        layer = layer_of(list(path.relative_to(PACKAGE).with_suffix("").parts))
+        assert layer in RANK, (
+            f"{layer} is not in the list of layers: say where it stands in the way of the data"
+        )
+        right = {other for other in imported_layers(path) if RANK[other] > RANK[layer]}
+        wrong += [f"{path.relative_to(PACKAGE)} imports from its right: {sorted(right)}"] if right else []
+    assert not wrong, "\n".join(wrong)

@@ -8,6 +8,9 @@ from collections import defaultdict
 from pathlib import Path
 
 import pytest
+import yaml
+
+import rigwake
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "src" / "rigwake"
@@ -72,6 +75,13 @@ def test_no_class_name_stands_in_two_files() -> None:
                 places[node.name].append(str(path.relative_to(PACKAGE)))
     twice = {name: found for name, found in places.items() if len(found) > 1}
     assert not twice, twice
+
+
+def test_the_version_is_written_once() -> None:
+    """In the package; the citation repeats it, as it is read without the program."""
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert str(cited["version"]) == rigwake.__version__
+    assert 'dynamic = ["version"]' in (ROOT / "pyproject.toml").read_text()
 
 
 @pytest.mark.parametrize("word", OLD_WORDS)

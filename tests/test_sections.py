@@ -169,7 +169,7 @@ def test_axes_that_nothing_tells_do_not_draw_in_the_whole_recording() -> None:
     told[:, 5] = 1e-3  # no stretch tells this one to 20 cm
     choice = choose_sections(made_up(told), np.ones(40))
     assert choice.stretches.tolist() == [5, 6, 7]
-    assert choice.whole["front"].undetermined == 1
+    assert choice.whole["front"].unobservable == 1
     told[:, 3:] = 1e-3
     assert tells_no_place(made_up(told))
 

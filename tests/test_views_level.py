@@ -148,7 +148,7 @@ def test_strip_leaves_out_masks_and_missing_cameras() -> None:
     assert [i for i, _, _ in camera_strips(images, rig, stand, WaterAndShell(), grid)] == [0, 1, 2, 3]
 
 
-def test_undetermined_parts_of_a_rig_are_said() -> None:
+def test_unobservable_parts_of_a_rig_are_said() -> None:
     rig = surround_rig(without_vertical(boat("base_link"), "port").rig)
     assert len(rig) == 4
     assert "port" in rig.notes[0]

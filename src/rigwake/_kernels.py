@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from glob import escape
+from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
@@ -24,6 +26,20 @@ class KernelFile(IndexDataCacheFile):
     def _data_name(self, number: int) -> str:
         name: str = super()._data_name(number)
         return f"{name.removesuffix('.nbc')}.{uuid4().hex[:16]}.nbc"
+
+    def _save_index(self, overloads: dict[Any, str]) -> None:
+        """Besides, remove what is outdated: of this kernel as it was, and where it stood in the source before."""
+        super()._save_index(overloads)
+        folder, own = Path(self._cache_path), self._index_name.removesuffix(".nbi")
+        outdated = set(folder.glob(f"{escape(own)}.*.nbc")) - {folder / name for name in overloads.values()}
+        for index in folder.glob(f"{escape(own.rpartition('-')[0])}-*.nbi"):
+            if (
+                index.stem != own
+                and not KernelFile(str(folder), index.stem, self._source_stamp)._load_index()
+            ):
+                outdated |= set(folder.glob(f"{escape(index.stem)}.*"))
+        for path in outdated:
+            path.unlink(missing_ok=True)
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from rigwake.config import CalibrateConfig
     from rigwake.pipeline.calibration_run import CalibrationRun
 
-_OPEN = "undetermined"
+_OPEN = "unobservable"
 
 
 def command(
@@ -250,7 +250,7 @@ def _millimetres(value_m: float, std_m: float) -> str:
 
 def print_calibration(calibration: Calibration) -> None:
     """The rig as a table: position with sigmas, sigma of the rotation, clock, repeatability."""
-    headings = ("camera", "x mm", "y mm", "z mm", "± deg", "offset ms", "halves")
+    headings = ("camera", "x mm", "y mm", "z mm", "± deg", "offset ms", "split-half")
     table = figures_table(headings)
     halves = calibration.checks.get("split_half", {})
     for name, camera in calibration.cameras.items():
@@ -269,7 +269,7 @@ def print_calibration(calibration: Calibration) -> None:
     out.print(table)
     print_looks(calibration)
     if halves:
-        out.print("[dim]deg: rotation, worst axis; halves: difference of both halves in sigmas[/dim]")
+        out.print("[dim]deg: rotation, worst axis; split-half: difference of both halves in sigmas[/dim]")
     for camera in calibration.cameras.values():
         for direction in camera.unobservable:
             out.print(f"[yellow]unobservable:[/yellow] {escape(direction.words)}. {escape(direction.remedy)}")

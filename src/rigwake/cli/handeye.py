@@ -286,7 +286,7 @@ def _print(result: HandeyeResult) -> None:
         out.print(others)
     print_looks(result.calibration())
     found = sum(camera.has_figures for camera in result.members.values())
-    out.print(f"{found} of {len(result.members)} mountings determined", highlight=False)
+    out.print(f"{found} of {len(result.members)} mountings observable", highlight=False)
     out.print(f"noise: {result.noise}; {result.steps} steps, {result.down_weighted} down-weighted")
     for camera in result.members.values():
         for d in camera.unobservable:

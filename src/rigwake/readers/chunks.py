@@ -9,8 +9,8 @@ import bz2
 import os
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -101,6 +101,54 @@ def read_chunk(file: int, chunk: Chunk) -> bytes:
     if chunk.stored_bytes > MAX_CHUNK_BYTES:
         raise InputError(f"A chunk claims to take {chunk.stored_bytes} bytes.")
     return unpack(os.pread(file, chunk.stored_bytes, chunk.position), chunk)
+
+
+@dataclass
+class ChunkScan:
+    """What one pass over a bag has gathered so far. entries: by connection or channel, (row of the chunk, entries).
+
+    suspect_chunks: whose index contradicts itself or the chunk; they are walked through instead.
+    """
+
+    chunks: list[Chunk] = field(default_factory=list)
+    entries: dict[int, list[tuple[int, NDArray[np.void]]]] = field(default_factory=dict)
+    indexed_chunks: set[int] = field(default_factory=set)
+    suspect_chunks: set[int] = field(default_factory=set)
+    problems: list[str] = field(default_factory=list)
+
+    def refuse_excess(self) -> None:
+        """Refuse chunks that claim more than the file can pack."""
+        self.chunks, refused = within_budget(self.chunks)
+        if refused:
+            self.problems.append(f"{refused} chunks claim to hold far more than the file can pack")
+
+    def walk_unindexed(
+        self,
+        file: int,
+        known: Collection[int],
+        walk: Callable[[bytes], Mapping[int, list[tuple[int, ...]]]],
+        entry: np.dtype[np.void],
+    ) -> None:
+        """Walk through chunks that have no index, and those with connections or channels that are not `known`.
+
+        walk: from a chunk's content to the entries of its messages; may learn what is known.
+        """
+        unknown = {row for c, parts in self.entries.items() if c not in known for row, _ in parts}
+        rebuilt = self.suspect_chunks | unknown
+        self.indexed_chunks -= rebuilt
+        for owner, parts in self.entries.items():
+            self.entries[owner] = [part for part in parts if part[0] not in rebuilt]
+        lost = []
+        for row in sorted(set(range(len(self.chunks))) - self.indexed_chunks):
+            try:
+                walked = walk(read_chunk(file, self.chunks[row]))
+            except InputError as error:
+                lost.append(f"({row}: {error.cause.rstrip('.')})")
+                continue
+            for owner, found in walked.items():
+                self.entries.setdefault(owner, []).append((row, np.array(found, entry)))
+        if lost:
+            self.problems.append(f"{len(lost)} of {len(self.chunks)} chunks are lost {lost[0]}")
 
 
 def message_span(record: bytes, framing: Framing, owner: int | None = None) -> tuple[int, int]:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigwake.errors import InputError
 from rigwake.readers.channels import (
@@ -26,7 +25,7 @@ from rigwake.readers.channels import (
     require_regular_file,
     standard_type_name,
 )
-from rigwake.readers.chunks import Chunk, payloads_in_order, read_chunk, within_budget
+from rigwake.readers.chunks import Chunk, ChunkScan, payloads_in_order
 from rigwake.readers.printable import printable
 from rigwake.recording import Finding
 
@@ -47,19 +46,13 @@ class _ChannelRecord(NamedTuple):
 
 
 @dataclass
-class _McapScan:
+class _McapScan(ChunkScan):
     """What the pass has gathered so far; messages outside chunks belong to one chunk that is the file."""
 
-    chunks: list[Chunk] = field(default_factory=list)
     schemas: dict[int, str] = field(default_factory=dict)
     channels: dict[int, _ChannelRecord] = field(default_factory=dict)
-    entries: dict[int, list[tuple[int, NDArray[np.void]]]] = field(default_factory=dict)
-    indexed_chunks: set[int] = field(default_factory=set)
-    suspect_chunks: set[int] = field(default_factory=set)
-    """Chunks whose index contradicts itself or the chunk: they are walked through instead."""
-    loose: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
+    loose: dict[int, list[tuple[int, ...]]] = field(default_factory=dict)
     stated_messages: int | None = None
-    problems: list[str] = field(default_factory=list)
 
 
 def index_mcap(path: Path) -> BagIndex:
@@ -72,11 +65,9 @@ def index_mcap(path: Path) -> BagIndex:
         file_bytes = os.fstat(file).st_size
         scan = _McapScan()
         _scan_records(file, file_bytes, scan)
-        scan.chunks, refused = within_budget(scan.chunks)
-        if refused:
-            scan.problems.append(f"{refused} chunks claim to hold far more than the file can pack")
+        scan.refuse_excess()
         _check_plain_chunks(file, scan)
-        _complete_from_chunks(file, scan)
+        scan.walk_unindexed(file, scan.channels, lambda content: _walk_chunk(content, scan), _ENTRY)
     finally:
         os.close(file)
     scan.chunks.append(Chunk(0, file_bytes, file_bytes, "none"))
@@ -176,7 +167,7 @@ def _add_chunk(start: bytes, content: int, stored_bytes: int, scan: _McapScan) -
     scan.chunks.append(Chunk(content + head, stored_bytes - head, unpacked, compression, crc))
 
 
-def _add_loose(start: bytes, position: int, loose: dict[int, list[tuple[int, int]]]) -> None:
+def _add_loose(start: bytes, position: int, loose: dict[int, list[tuple[int, ...]]]) -> None:
     if len(start) < 22:
         raise InputError("a message is cut off")
     channel, _, log_time = struct.unpack_from("<HIQ", start)
@@ -219,25 +210,9 @@ def _string(content: bytes, at: int) -> tuple[str, int]:
     return content[at + 4 : at + 4 + size].decode("utf-8", "replace"), at + 4 + size
 
 
-def _complete_from_chunks(file: int, scan: _McapScan) -> None:
-    """Walk through chunks that have no index, and those that hold channels not yet known."""
-    unknown = {row for c, parts in scan.entries.items() if c not in scan.channels for row, _ in parts}
-    rebuilt = scan.suspect_chunks | unknown
-    scan.indexed_chunks -= rebuilt
-    for channel, parts in scan.entries.items():
-        scan.entries[channel] = [part for part in parts if part[0] not in rebuilt]
-    lost = []
-    for chunk_row in sorted(set(range(len(scan.chunks))) - scan.indexed_chunks):
-        try:
-            _walk_chunk(read_chunk(file, scan.chunks[chunk_row]), chunk_row, scan)
-        except InputError as error:
-            lost.append(f"({chunk_row}: {error.cause.rstrip('.')})")
-    if lost:
-        scan.problems.append(f"{len(lost)} of {len(scan.chunks)} chunks are lost {lost[0]}")
-
-
-def _walk_chunk(content: bytes, chunk_row: int, scan: _McapScan) -> None:
-    found: dict[int, list[tuple[int, int]]] = {}
+def _walk_chunk(content: bytes, scan: _McapScan) -> dict[int, list[tuple[int, ...]]]:
+    """Entries of its messages, by their owner; what describes the owners is added to the scan."""
+    found: dict[int, list[tuple[int, ...]]] = {}
     at = 0
     while at < len(content):
         try:
@@ -252,9 +227,7 @@ def _walk_chunk(content: bytes, chunk_row: int, scan: _McapScan) -> None:
         except InputError:
             break
         at = end
-    if chunk_row not in scan.indexed_chunks:
-        for channel, entries in found.items():
-            scan.entries.setdefault(channel, []).append((chunk_row, np.array(entries, _ENTRY)))
+    return found
 
 
 def _channels(path: Path, scan: _McapScan) -> tuple[list[Channel], list[Finding]]:

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigwake.errors import InputError
 from rigwake.readers.channels import BagIndex, Channel, joined, require_regular_file, standard_type_name
-from rigwake.readers.chunks import Chunk, payloads_in_order, read_chunk, within_budget
+from rigwake.readers.chunks import Chunk, ChunkScan, payloads_in_order
 from rigwake.readers.ros_decoding import is_standard_type, type_of_digest
 from rigwake.recording import Finding
 
@@ -48,16 +47,10 @@ class Record(NamedTuple):
 
 
 @dataclass
-class _BagScan:
+class _BagScan(ChunkScan):
     """What the pass has gathered so far."""
 
-    chunks: list[Chunk] = field(default_factory=list)
     connections: dict[int, tuple[str, str, str]] = field(default_factory=dict)
-    entries: dict[int, list[tuple[int, NDArray[np.void]]]] = field(default_factory=dict)
-    indexed_chunks: set[int] = field(default_factory=set)
-    suspect_chunks: set[int] = field(default_factory=set)
-    """Chunks whose index contradicts itself or the chunk: they are walked through instead."""
-    problems: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
 
 
@@ -70,10 +63,10 @@ def index_rosbag1(path: Path) -> BagIndex:
             raise InputError(f"{path.name} is not a ROS 1 bag of format 2.0.")
         scan = _BagScan()
         _scan_records(file, os.fstat(file).st_size, scan)
-        scan.chunks, refused = within_budget(scan.chunks)
-        if refused:
-            scan.problems.append(f"{refused} chunks claim to hold far more than the file can pack")
-        _complete_from_chunks(file, scan)
+        scan.refuse_excess()
+        scan.walk_unindexed(file, scan.connections, lambda content: _walk_chunk(content, scan), _ENTRY)
+        if scan.suspect_chunks:
+            scan.problems.append(f"The index of {len(scan.suspect_chunks)} chunks is damaged")
     finally:
         os.close(file)
     findings = tuple(
@@ -192,27 +185,9 @@ def _add_connection(details: bytes, record: Record, scan: _BagScan) -> None:
             scan.connections[number] = described
 
 
-def _complete_from_chunks(file: int, scan: _BagScan) -> None:
-    """Walk through chunks that have no index, and those that hold connections not yet known."""
-    unknown = {row for c, parts in scan.entries.items() if c not in scan.connections for row, _ in parts}
-    rebuilt = scan.suspect_chunks | unknown
-    scan.indexed_chunks -= rebuilt
-    for connection, parts in scan.entries.items():
-        scan.entries[connection] = [part for part in parts if part[0] not in rebuilt]
-    lost = []
-    for chunk_row in sorted(set(range(len(scan.chunks))) - scan.indexed_chunks):
-        try:
-            _walk_chunk(read_chunk(file, scan.chunks[chunk_row]), chunk_row, scan)
-        except InputError as error:
-            lost.append(f"({chunk_row}: {error.cause.rstrip('.')})")
-    if lost:
-        scan.problems.append(f"{len(lost)} of {len(scan.chunks)} chunks are lost {lost[0]}")
-    if scan.suspect_chunks:
-        scan.problems.append(f"The index of {len(scan.suspect_chunks)} chunks is damaged")
-
-
-def _walk_chunk(content: bytes, chunk_row: int, scan: _BagScan) -> None:
-    found: dict[int, list[tuple[int, int, int]]] = {}
+def _walk_chunk(content: bytes, scan: _BagScan) -> dict[int, list[tuple[int, ...]]]:
+    """Entries of its messages, by their owner; what describes the owners is added to the scan."""
+    found: dict[int, list[tuple[int, ...]]] = {}
     at = 0
     while at < len(content):
         try:
@@ -229,9 +204,7 @@ def _walk_chunk(content: bytes, chunk_row: int, scan: _BagScan) -> None:
         except InputError:
             break
         at = end
-    if chunk_row not in scan.indexed_chunks:
-        for connection, entries in found.items():
-            scan.entries.setdefault(connection, []).append((chunk_row, np.array(entries, _ENTRY)))
+    return found
 
 
 def _channels(path: Path, scan: _BagScan) -> list[Channel]:

@@ -34,11 +34,11 @@ class Precision:
 @dataclass(frozen=True)
 class CameraSigmas:
     """Predicted sigmas of one camera along its worst axis, among those that the recording tells to a degree and 20 cm;
-    rad and m. undetermined: how many of its six axes it tells no better."""
+    rad and m. unobservable: how many of its six axes it tells no better."""
 
     rotation: float
     translation: float
-    undetermined: int = 0
+    unobservable: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ def _largest_std(half: Array) -> float:
 def tells_no_place(information: StretchInformation) -> bool:
     """Whether even all of it leaves the place of every camera unobservable, along any axis."""
     sigmas = WhitenedInformation(information, _UNOBSERVABLE).sigmas(list(range(len(information))))
-    return bool(sigmas) and all(s.undetermined >= 3 for s in sigmas.values())
+    return bool(sigmas) and all(s.unobservable >= 3 for s in sigmas.values())
 
 
 def choose_sections(

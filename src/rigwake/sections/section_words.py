@@ -56,7 +56,7 @@ def sigma_words(sigmas: CameraSigmas) -> str:
     """`0.012 deg, 3.4 mm`, and what cannot be told."""
     words = f"{np.degrees(sigmas.rotation):.3f} deg, {1e3 * sigmas.translation:.1f} mm"
     return words + (
-        f" ({sigmas.undetermined} of 6 axes not told to 1 deg and 20 cm)" if sigmas.undetermined else ""
+        f" ({sigmas.unobservable} of 6 axes not told to 1 deg and 20 cm)" if sigmas.unobservable else ""
     )
 
 
@@ -102,7 +102,7 @@ def plan_to_dict(plan: SectionPlan) -> dict[str, Any]:
             name: {
                 "rotation_deg": float(np.degrees(s.rotation)),
                 "translation_m": s.translation,
-                "unobservable_axes": s.undetermined,
+                "unobservable_axes": s.unobservable,
             }
             for name, s in found.items()
         }

@@ -1,9 +1,9 @@
-"""How sure the bundle adjustment is: covariances of shared parameters and states, and what cannot be determined.
+"""How sure the bundle adjustment is: covariances of shared parameters and states, and what is unobservable.
 
 The information of the shared parameters, with every state and landmark unknown beside them, is the reduced
 matrix `S = C - B^T A^-1 B` of `normal.py`, taken without damping. Scaled by the information each parameter
 would have if everything else were known, its eigenvalues are comparable numbers between 0 and 1: the fraction
-that is left once nothing else is known. Where (next to) none is left, the direction is undetermined: an exact
+that is left once nothing else is known. Where (next to) none is left, the direction is unobservable: an exact
 symmetry of the problem, such as turning the rig's axes when only GNSS ties them to the world. A pseudo-inverse
 or a damped inverse would print a number there; this module prints none.
 """
