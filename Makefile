@@ -2,20 +2,31 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
+DEMO_STAMP := .venv/.installed-demo
 
 # compiled sources are kept: the tests start many processes, which would compile them again each time
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test test-fast lint bench mutants coverage docs release-check clean
 
-$(STAMP): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	  { echo "rigwake needs Python 3.11 or newer, found $$($(PYTHON) --version). Remedy: make PYTHON=python3.12"; exit 1; }
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	@touch $(STAMP)
+define environment
+@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+  { echo "rigwake needs Python 3.11 or newer, found $$($(PYTHON) --version). Remedy: make PYTHON=python3.12"; exit 1; }
+test -x $(BIN)/python || $(PYTHON) -m venv .venv
+endef
 
-demo: $(STAMP)
+$(STAMP): pyproject.toml constraints.txt
+	$(environment)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $(STAMP) $(DEMO_STAMP)
+
+# what only developers need takes longer to install than the demo to run
+$(DEMO_STAMP): pyproject.toml constraints.txt
+	$(environment)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[sim]'
+	@touch $(DEMO_STAMP)
+
+demo: $(DEMO_STAMP)
 	$(BIN)/rigwake demo -o demo
 
 test-fast: $(STAMP)

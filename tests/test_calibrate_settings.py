@@ -14,6 +14,7 @@ from rigwake.ba.rig.assemble_problem import assemble_problem
 from rigwake.ba.rig.rig_values import AdjustmentOptions, InitialRig
 from rigwake.ba.solver.rig_problem import PosePrior
 from rigwake.calibration import Calibration
+from rigwake.cli.calibrate import SETTINGS
 from rigwake.cli.console import write_json
 from rigwake.config import CalibrateConfig, load_config
 from rigwake.errors import InputError, UnobservableError, UsageError
@@ -239,3 +240,9 @@ def test_json_files_hold_no_nan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert loaded["odometry"]["inlier_rms_px"] is None
     write_json(tmp_path / "any.json", {"a": [np.inf, np.float64(np.nan), 1.0], "b": np.array([np.nan])})
     assert json.loads((tmp_path / "any.json").read_text()) == {"a": [None, None, 1.0], "b": [None]}
+
+
+def test_the_settings_of_the_help_exist() -> None:
+    assert len(SETTINGS) == 10
+    for setting in SETTINGS:
+        assert load_config(assignments=[setting]) != load_config(), setting

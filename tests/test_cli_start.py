@@ -66,6 +66,19 @@ def test_help_loads_nothing_heavy_and_stays_small(words: list[str]) -> None:
     assert int(peak_kb) / 1024 < 80
 
 
+def test_completion_loads_nothing_that_only_work_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    program = (
+        "import sys\nfrom rigwake.cli.main import main\ntry: main([])\nexcept SystemExit: pass\n"
+        f"print(*sorted(set(sys.modules) & set({(*_HEAVY, 'rich.progress', 'rich.panel')!r})), file=sys.stderr)"
+    )
+    monkeypatch.setenv("_RIGWAKE_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", "rigwake calibrate --intr")
+    monkeypatch.setenv("COMP_CWORD", "2")
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["--intrinsics"]
+    assert done.stderr.split() == []
+
+
 def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "sail"
     folder.mkdir()

@@ -6,6 +6,7 @@ import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -29,6 +30,7 @@ from rigwake.pipeline.calibration_run import CalibrationRun, calibrate
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.readers.truth_files import rig_in_frame
 from rigwake.recording import Recording
+from rigwake.report.adjustment_file import read_adjustment
 from rigwake.rig import Rig
 from rigwake.tracks import load_tracks
 from rigwake.writers.write import write_recording
@@ -95,6 +97,7 @@ class TestTheRig:
         assert set(checks["split_half"]) == set(OFFSETS_MS)
         for half in checks["split_half"].values():
             assert half["sigmas"] < 4
+            assert [np.isfinite(h["std_translation_m"]).all() for h in half["halves"]] == [True, True]
             assert half["rotation_deg"] < 0.2
         assert checks["converged"] is True
         assert checks["failed_cameras"] == {}
@@ -168,13 +171,35 @@ class TestWhatIsLeft:
 
     def test_pictures_lie_on_what_they_show(self, sail: Sail) -> None:
         entries = json.loads((sail.run.out / "pictures" / "pictures.json").read_text())
-        assert {entry["kind"] for entry in entries} == {"horizon", "hand_over"}
+        assert {entry["kind"] for entry in entries} == {"horizon", "hand_over", "patches"}
         distances = []
         for entry in entries:
             assert (sail.run.out / "pictures" / entry["file"]).is_file()
             for point in entry["points"]:
                 distances.append(np.hypot(*np.subtract(point["predicted_px"], point["observed_px"])))
         assert np.median(distances) < 0.5
+
+    def test_patches_look_as_predicted(self, sail: Sail) -> None:
+        folder, alike = sail.run.out / "pictures", []
+        entries = json.loads((folder / "pictures.json").read_text())
+        patches = [entry for entry in entries if entry["kind"] == "patches"]
+        assert 2 <= len(patches) <= 24
+        assert any(entry["camera"] != entry["points"][0]["from_camera"] for entry in patches)
+        for entry in patches:
+            tiles = cv2.imread(str(folder / entry["file"]), cv2.IMREAD_GRAYSCALE)
+            side = len(tiles)
+            assert tiles.shape == (side, 3 * side)
+            predicted, found = tiles[:, side : 2 * side], tiles[:, 2 * side :]
+            alike.append(np.corrcoef(predicted.ravel(), found.ravel())[0, 1])
+        assert np.median(alike) > 0.8
+
+    def test_sensors_and_landmarks_are_kept_for_the_report(self, sail: Sail) -> None:
+        record = read_adjustment(sail.run.out / "adjustment.npz")
+        assert record.landmarks is not None
+        assert record.imu_turn is not None
+        page = (sail.run.out / "report.html").read_text()
+        assert "IMU over time" in page
+        assert "adjustment.npz" not in page  # nothing is missing
 
     def test_tracks_hold_bearings_of_their_pixels(self, sail: Sail) -> None:
         for name in OFFSETS_MS:

@@ -371,8 +371,16 @@ def test_rerun_recording(folder: Path, tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     content = (tmp_path / "rig.rrd").read_bytes()
     assert content[:3] == b"RRF"
-    for entity in (b"/world/rig/front/image", b"/world/rig/port", b"/world/path"):
-        assert entity in content
+    for entity in (
+        b"/world/rig/front/image",
+        b"/world/rig/front/image/predicted",
+        b"/world/rig/port",
+        b"/world/rig/sigma/port",
+        b"/world/path",
+        b"/world/landmarks",
+        b"/residuals_px/aft",
+    ):
+        assert entity in content, entity
 
 
 def test_a_viewer_that_cannot_start_says_so(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,6 +86,15 @@ def test_the_rig_is_drawn_and_turns(browser, pages: dict[str, Path], name: str) 
     assert browser.find_element(By.ID, "sigma-value").text == "200"
 
 
+def test_landmarks_are_drawn_and_can_be_hidden(browser, pages: dict[str, Path]) -> None:
+    open_page(browser, pages["good"])
+    show(browser, "motion")
+    drawn = "return Number(document.getElementById('path3d').dataset.drawn)"
+    with_landmarks = browser.execute_script(drawn)
+    browser.find_element(By.ID, "landmarks").click()
+    assert browser.execute_script(drawn) == with_landmarks - 4  # a cloud per camera
+
+
 def test_tabs_follow_the_keyboard(browser, pages: dict[str, Path]) -> None:
     open_page(browser, pages["good"])
     first = browser.find_element(By.ID, "tab-rig")

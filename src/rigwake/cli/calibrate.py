@@ -41,6 +41,23 @@ if TYPE_CHECKING:
     from rigwake.pipeline.calibration_run import CalibrationRun
 
 _OPEN = "unobservable"
+SETTINGS = {
+    "min_duration_s=5": "calibrate from less than 15 s",
+    "imu=false": "do not use the IMU; gnss=false: nor the GNSS",
+    "time_offsets=false": "the cameras' clocks are those of the rig",
+    "line_delay_s.front=3e-5": "a rolling shutter: seconds per row; estimate_line_delay=true refines it",
+    "imu_noise.gyro_noise_density=2e-4": "rad/s/rtHz, if you know it; accel_noise_density: m/s2/rtHz",
+    "find_self_mask=false": "do not look for the hull in the images",
+    "sensor_checks=false": "do not compare the sensors with each other",
+    "tracking.max_features=600": "corners per image",
+    "adjustment.cross_camera=false": "do not look for the landmarks of other cameras",
+    "adjustment.tracks_per_second=120": "tracks per camera and second in the adjustment",
+}
+HELP = (
+    "Ten settings worth knowing, for --set, or as YAML for --config (all of them: --print-config):\n\n"
+    + "\n\n".join(f"[cyan]{setting}[/cyan]  {what}" for setting, what in SETTINGS.items())
+)
+"""Stands below the options in `calibrate --help`."""
 
 
 def command(

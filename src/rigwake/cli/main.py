@@ -92,7 +92,8 @@ def build_app(
         if verb in GROUPS:
             app.add_typer(_group(module.COMMANDS, module.__doc__ or ""), name=verb)
         else:
-            app.command(verb, epilog=EXIT_CODES)(_outlined(module.command) if outline else module.command)
+            epilog = "\n\n".join(filter(None, [getattr(module, "HELP", ""), EXIT_CODES]))
+            app.command(verb, epilog=epilog)(_outlined(module.command) if outline else module.command)
     return app
 
 

@@ -183,11 +183,11 @@ def top_view(title: str, paths: Sequence[Series], unit: str = "m", cloud: Sequen
         return [f"{a:.1f},{b:.1f}" for a, b in zip(u.tolist(), v.tolist(), strict=True)]
 
     parts = []
-    for x in ticks(x_low, x_high):
+    for x in _multiples(x_low, x_high, span):
         u, label = left + (x - x_low) * scale, f'text-anchor="middle">{axis_text(x)}</text>'
         parts.append(f'<path class="grid" d="M{u:.1f},{margin:.1f}V{height - bottom:.1f}"/>')
         parts.append(f'<text class="tick" x="{u:.1f}" y="{height - bottom + 15:.1f}" {label}')
-    for y in ticks(y_low, y_high, max(1, round(5 * (y_high - y_low) / span))):
+    for y in _multiples(y_low, y_high, span):
         v, label = height - margin - bottom - (y - y_low) * scale, f'text-anchor="end">{axis_text(y)}</text>'
         parts.append(f'<path class="grid" d="M{left:.1f},{v:.1f}H{width - margin:.1f}"/>')
         parts.append(f'<text class="tick" x="{left - 5:.1f}" y="{v + 4:.1f}" {label}')
@@ -207,6 +207,13 @@ def top_view(title: str, paths: Sequence[Series], unit: str = "m", cloud: Sequen
         f"{escape(words)}</text>"
     )
     return svg(title, width, height, parts, "map")
+
+
+def _multiples(low: float, high: float, span: float) -> list[float]:
+    """Inside an interval, the multiples of the step that suits a `span`."""
+    marks = ticks(0.0, span)
+    step = marks[1] if len(marks) > 1 else span
+    return [float(k * step) for k in np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1)]
 
 
 def _near(cloud: Series, x: tuple[float, float], y: tuple[float, float]) -> Series:

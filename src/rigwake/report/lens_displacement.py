@@ -13,6 +13,8 @@ from rigwake.cameras.registry import camera_from_dict
 from rigwake.errors import CameraError
 from rigwake.report.reduce import MAP_COLUMNS, MAP_ROWS, ImageMap
 
+_UNMOVED_PX = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class LensDisplacement:
@@ -36,8 +38,11 @@ def lens_displacements(calibration: Calibration) -> dict[str, LensDisplacement]:
             given = camera_from_dict(told["given_camera"])
         except CameraError:  # of another version
             continue
+        over_picture = _over_picture(given, camera.model)
+        if over_picture.counts.max() < _UNMOVED_PX:
+            continue
         found[name] = LensDisplacement(
-            _over_picture(given, camera.model),
+            over_picture,
             told.get("moved_rms_px"),
             told.get("moved_max_px"),
             (given.model, camera.model.model),

@@ -109,9 +109,15 @@ def _values(content: ReportContent) -> dict[str, Any]:
         "provenance": plain(calibration.provenance),
         "steps": _first_guess(content),
         "displacements": lens_displacements(calibration),
+        "refined": {
+            name: plain(found)
+            for name, c in calibration.cameras.items()
+            if isinstance(found := c.statistics.get("intrinsics"), Mapping)
+        },
         "statistics": {name: plain(c.statistics) for name, c in calibration.cameras.items() if c.statistics},
         "statistic_names": list(
-            dict.fromkeys(key for c in calibration.cameras.values() for key in c.statistics)
+            # what was found of the lens has a table of its own
+            dict.fromkeys(k for c in calibration.cameras.values() for k in c.statistics if k != "intrinsics")
         ),
     }
 

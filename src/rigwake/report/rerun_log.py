@@ -14,6 +14,17 @@ from rigwake.geometry.se3 import SE3
 from rigwake.report.content import RIG_TRAJECTORY, ReportContent
 from rigwake.report.motion_figures import thin
 
+# as in the report's own charts
+_COLOURS = (
+    (0, 114, 178),
+    (213, 94, 0),
+    (0, 158, 115),
+    (204, 121, 167),
+    (86, 180, 233),
+    (230, 159, 0),
+    (143, 132, 0),
+    (77, 77, 77),
+)
 _SIGMAS_DRAWN = 20  # as the report's slider at first: true sizes would hardly be seen
 
 
@@ -57,6 +68,7 @@ def _log(rerun: Any, stream: Any, content: ReportContent) -> None:
     stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     _log_cameras(rerun, stream, content)
     _log_motion(rerun, stream, content)
+    _log_landmarks(rerun, stream, content)
     _log_sigmas(rerun, stream, content)
     _log_residuals(rerun, stream, content)
     _log_pictures(rerun, stream, content)
@@ -98,6 +110,17 @@ def _log_motion(rerun: Any, stream: Any, content: ReportContent) -> None:
         stream.log("world/rig", _transform(rerun, rig.world_from_body[k]))
 
 
+def _log_landmarks(rerun: Any, stream: Any, content: ReportContent) -> None:
+    """Landmarks of the adjustment, in colours by the camera that saw each first."""
+    cloud = content.adjustment.landmarks
+    if cloud is None:
+        return
+    names = list(content.calibration.cameras)
+    places = [names.index(name) if name in names else len(_COLOURS) - 1 for name in cloud.cameras]
+    colours = [_COLOURS[place % len(_COLOURS)] for place in places]
+    stream.log("world/landmarks", rerun.Points3D(cloud.points_world, colors=colours, radii=0.05), static=True)
+
+
 def _log_sigmas(rerun: Any, stream: Any, content: ReportContent) -> None:
     """Per camera an ellipsoid of its position, as many sigmas large as the report's; only where every axis is known."""
     for name, camera in content.calibration.cameras.items():
@@ -133,7 +156,7 @@ def _log_residuals(rerun: Any, stream: Any, content: ReportContent) -> None:
 def _log_pictures(rerun: Any, stream: Any, content: ReportContent) -> None:
     """The pictures of the report in the frustum of their camera; landmarks where they are and where they must be."""
     for shown in content.pictures:
-        if not shown.file.is_file():
+        if not shown.file.is_file() or shown.kind == "patches":
             continue
         stream.set_time("time", timestamp=np.datetime64(shown.timestamp_ns, "ns"))
         place = f"world/rig/{shown.camera}/image"

@@ -122,10 +122,11 @@ def path_scene(
     shown = np.concatenate([everything, points])
     # heights of a few landmarks that lie wrong would put the grid below the world
     floor = np.array([*shown[:, :2].min(axis=0), np.quantile(shown[:, 2], 0.02)])
+    box = np.array([floor, shown.max(axis=0)]) - middle
     return {
         "extent": extent,
-        "middle": [0, 0, 0],
-        "radius": extent,
+        "middle": _rounded(box.mean(axis=0)),
+        "radius": round(float(np.linalg.norm(np.ptp(box, axis=0)) / 2), 3),
         "paths": [
             {"name": n, "colour": colours.get(n, -1), "points": (p - middle).round(_PATH_DIGITS).tolist()}
             for n, p in paths.items()
@@ -135,7 +136,7 @@ def path_scene(
             for name in dict.fromkeys(names)
             if len(chosen := np.flatnonzero(np.array(names) == name))
         ],
-        "grid": _grid(floor - middle, shown.max(axis=0) - middle, middle),
+        "grid": _grid(*box, middle),
     }
 
 
