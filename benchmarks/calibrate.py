@@ -2,6 +2,7 @@
 without and with cross-camera association.
 
     python benchmarks/calibrate.py [--peers] [RECORDING TRUTH | PRESET]...
+    python benchmarks/calibrate.py --nees [--keep FOLDER] [NAME]...
 
 Without arguments: `harbour_a` and `kitti_03_split` in RIGWAKE_DATA, or in ../shared/data beside the project, and the
 presets `demo` and `thesis_lively`, which are rendered first. --peers: pycolmap too, see `colmap_rig.py` (some ten
@@ -9,6 +10,11 @@ minutes). Errors are those of the worst camera in the frame of the reference, an
 common reference; NEES is that of the best and of the worst camera, and 6 is expected.
 Seconds and peak memory are of the whole process and its children, from images to calibration; `hand-eye only` stops
 before the bundle adjustment, so it has no figures of its own.
+
+--nees: are the deviations honest? Small rendered recordings (three cameras, half a minute) of three layouts on calm and
+rough water, with RTK, a receiver of a metre whose error lasts, and none; NEES per degree of freedom of every camera in
+the frame of the IMU, its mean and its largest. 1 is expected. Ends with exit code 1 if the mean is not in 0.6-1.6 or
+a camera is above 3. --keep: recordings and calibrations stay in FOLDER, and what is there is taken again.
 """
 
 import os
@@ -17,6 +23,8 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+
+import yaml
 
 from rigwake.api import simulate
 from rigwake.calibration import Calibration, load_calibration
@@ -32,6 +40,7 @@ from rigwake.pipeline.camera_stage import tracks_file
 from rigwake.readers.open import open_recording
 from rigwake.readers.truth_files import read_true_rig, rig_in_frame
 from rigwake.rig import Rig
+from rigwake.simulation.scenario import load_scenario
 from rigwake.tracks import load_tracks
 
 METHODS: tuple[tuple[str, tuple[str, ...]], ...] = (
@@ -39,7 +48,24 @@ METHODS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("lenses held", ("intrinsics=fixed",)),
     ("no cross-camera association", ("adjustment.cross_camera=false",)),
 )
+WITHOUT_CHECKS = (
+    "sensors believed",
+    ("sensor_checks=false",),
+)  # from images again: their cost is in every stage
 PEER_RATE_HZ = 1.0  # all pairs of images are matched: twice the rate takes four times as long
+SMALL = 0.75  # of the presets' pictures
+# name -> preset, significant wave height in metres, receiver
+HONEST: dict[str, tuple[str, float, str]] = {
+    "demo_calm_rtk": ("demo", 0.0, "rtk"),
+    "demo_waves_metre": ("demo", 0.25, "metre"),
+    "demo_rough_none": ("demo", 0.6, "none"),
+    "marina_calm_rtk": ("marina", 0.02, "rtk"),
+    "marina_waves_none": ("marina", 0.3, "none"),
+    "quay_calm_metre": ("quay", 0.02, "metre"),
+    "quay_waves_rtk": ("quay", 0.2, "rtk"),
+    "demo_rough_rtk": ("demo", 0.7, "rtk"),
+}
+NEES_MEAN, NEES_WORST = (0.6, 1.6), 3.0  # per degree of freedom
 DATA = Path(os.environ.get("RIGWAKE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
 
@@ -98,26 +124,41 @@ def pycolmap_rig(recording: Path) -> Calibration | str:
         return str(error.cause)
 
 
+def calibrated(
+    name: str, truth: Rig, method: str, settings: tuple[str, ...], out: Path, *, resumed: bool, given: Path
+) -> float:
+    """Prints a row of the table; CPU seconds."""
+    wall, cpu = time.perf_counter(), cpu_s()
+    try:
+        found: Calibration | str = calibrate(
+            given, out, load_config(None, settings), resume=resumed
+        ).calibration
+    except RigwakeError as error:
+        found = str(error.cause)
+    wall, cpu = time.perf_counter() - wall, cpu_s() - cpu
+    tracked = " after tracking" if resumed else f", peak {peak_gb():.2f} GB"
+    row(name, method, found, truth, f"{cpu:.0f} CPU s, {wall:.0f} s{tracked}")
+    return cpu
+
+
 def compare(recording: Path, truth_file: Path, peers: bool) -> None:
     name, truth = recording.stem, read_true_rig(truth_file)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
+        used = {}
         for method, settings in METHODS:
-            resumed = bool(settings)
-            wall, cpu = time.perf_counter(), cpu_s()
-            try:
-                found: Calibration | str = calibrate(
-                    recording, out, load_config(None, settings), resume=resumed
-                ).calibration
-            except RigwakeError as error:
-                found = str(error.cause)
-            wall, cpu = time.perf_counter() - wall, cpu_s() - cpu
-            tracked = " after tracking" if resumed else f", peak {peak_gb():.2f} GB"
-            row(name, method, found, truth, f"{cpu:.0f} CPU s, {wall:.0f} s{tracked}")
+            used[method] = calibrated(
+                name, truth, method, settings, out, resumed=bool(settings), given=recording
+            )
+        checked = used[METHODS[0][0]]
+        unchecked = calibrated(name, truth, *WITHOUT_CHECKS, out / "believed", resumed=False, given=recording)
         row(name, "hand-eye only", load_calibration(out / "initial_rig.yaml"), truth, "")
         cpu = cpu_s()
         found = thesis_pipeline(recording, out)
         row(name, "thesis pipeline", found, truth, f"{cpu_s() - cpu:.0f} CPU s after tracking")
+        print(
+            f"\ncomparing the sensors took {100 * (checked / unchecked - 1):+.0f} % of {unchecked:.0f} CPU s\n"
+        )
     if peers:
         wall, cpu = time.perf_counter(), cpu_s()
         found = pycolmap_rig(recording)
@@ -132,8 +173,63 @@ def compare_preset(preset: str, peers: bool) -> None:
         compare(recording, Path(folder) / f"{preset}_truth" / "truth.yaml", peers)
 
 
+def small_scenario(name: str, folder: Path) -> Path:
+    """A scenario file of one of `HONEST`."""
+    preset, waves_m, receiver = HONEST[name]
+    document = load_scenario(preset).model_dump(mode="json")
+    document["name"], document["sea"]["hs_m"] = name, waves_m
+    document["seed"] = 100 + list(HONEST).index(name)
+    document["cameras"] = [c for c in document["cameras"] if c["name"] != "back"]
+    for camera in document["cameras"]:
+        for size in ("width_px", "height_px"):
+            camera[size] = round(SMALL * camera[size])
+        camera["params"] |= {k: SMALL * camera["params"][k] for k in ("fx", "fy", "cx", "cy")}
+    metre = {"white_std_m": 0.25, "correlated_std_m": 1.0, "correlated_tau_s": 40.0, "quality": "standalone"}
+    document["gnss"] = (
+        None if receiver == "none" else document["gnss"] | (metre if receiver == "metre" else {})
+    )
+    file = folder / f"{name}.yaml"
+    file.write_text(yaml.safe_dump(document))
+    return file
+
+
+def honesty(names: list[str], folder: Path) -> int:
+    """One row per recording: NEES per degree of freedom of every camera, errors, deviations of the heights."""
+    print("| recording | NEES per dof, by camera | worst deg | worst mm | used |\n|---|---|---|---|---|")
+    found: list[float] = []
+    for name in names:
+        recording, out, started = folder / name, folder / f"{name}_out", cpu_s()
+        if not recording.exists():
+            simulate(small_scenario(name, folder), recording, jobs=1)
+        if not (out / "calibration.yaml").exists():
+            calibrate(recording, out, load_config(None, ("reference=imu",)), resume=out.exists())
+        truth = rig_in_frame(read_true_rig(folder / f"{name}_truth" / "truth.yaml"), "imu")
+        errors = evaluate_calibration(load_calibration(out / "calibration.yaml"), truth).cameras
+        nees = {n: e.nees / e.nees_dof for n, e in errors.items() if e.nees is not None}
+        found += nees.values()
+        words = ", ".join(f"{n} {value:.2f}" for n, value in nees.items())
+        turn = max(e.rotation_error_deg for e in errors.values())
+        shift = max(e.translation_error_norm_m for e in errors.values())
+        print(
+            f"| {name} | {words} | {turn:.4f} | {1000 * shift:.1f} | {cpu_s() - started:.0f} CPU s |",
+            flush=True,
+        )
+    mean, worst = sum(found) / max(len(found), 1), max(found, default=0.0)
+    print(f"\nmean {mean:.2f} over {len(found)} cameras of {len(names)} recordings; largest {worst:.2f}")
+    return int(not (NEES_MEAN[0] <= mean <= NEES_MEAN[1] and worst <= NEES_WORST))
+
+
 def main() -> None:
     given = [argument for argument in sys.argv[1:] if argument != "--peers"]
+    if "--nees" in given:
+        given.remove("--nees")
+        with tempfile.TemporaryDirectory() as folder:
+            kept = Path(folder)
+            if "--keep" in given:
+                kept = Path(given.pop(given.index("--keep") + 1))
+                given.remove("--keep")
+                kept.mkdir(parents=True, exist_ok=True)
+            sys.exit(honesty(given or list(HONEST), kept))
     if not given:
         for name, file in (("harbour_a", "harbour_a.bag"), ("kitti_03_split", "")):
             given += [str(DATA / name / file), str(DATA / name / "truth.yaml")]

@@ -6,12 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rigwake.geometry import so3
 from rigwake.plausibility.coarse_turns import vet_turns
 from rigwake.plausibility.force_checks import check_forces, compare_forces
 from rigwake.plausibility.gyro_axes import check_axes
 from rigwake.plausibility.imu_samples import vet_samples
 from rigwake.plausibility.receiver_checks import VettedReceiver
 from rigwake.plausibility.stamp_rates import rate_of_stamps
+from rigwake.plausibility.turn_checks import check_mounts
 from rigwake.recording import GnssStream, ImuStream
 from rigwake.tracking.front_ends import _TrackingRun
 from test_plausibility import drifting, fits, gnss, imu, paths, vetted, wrong
@@ -57,6 +59,13 @@ def test_an_axis_of_the_gyroscope_is_not_the_fault_of_every_camera(axis: int, ga
     assert f"its {'xyz'[axis]} axis shows {gain:.2f}" in wrong(checks)["gyroscope"]
     assert not check_axes(fits(imu()))
     assert not check_axes(fits(imu(calm=True), paths(calm=True)))
+
+
+def test_where_no_camera_keeps_its_mounting_it_is_the_imu() -> None:
+    gyro = imu().gyro.copy()
+    half = len(gyro) // 2
+    gyro[half:] = gyro[half:] @ so3.exp(np.array([0.05, 0.0, 0.1])).T
+    assert set(wrong(check_mounts(fits(replace(imu(), gyro=gyro))))) == {"imu"}
 
 
 def test_dead_axes_are_named_and_those_that_stand_still_for_a_while_bridged() -> None:

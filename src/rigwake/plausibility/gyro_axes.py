@@ -12,7 +12,7 @@ from rigwake.plausibility.turn_fit import TurnFit
 from rigwake.plausibility.values import SensorCheck
 
 _GAIN, _SIGMAS = 0.08, 6.0
-_KNOWN = 5.0  # times the noise of a turn, by which turns about an axis vary for its gain to be known
+_KNOWN = 3.0  # times the noise of a turn, by which turns about an axis vary for its gain to be known
 
 
 def axis_gains(fit: TurnFit) -> tuple[Array, Array]:
@@ -39,8 +39,11 @@ def axis_gains(fit: TurnFit) -> tuple[Array, Array]:
     spread = np.einsum("ki,ij,kj->k", along, np.linalg.inv(information), along)
     noise = np.sqrt(np.median(off**2, axis=0)) * 1.48
     turned = 1 / np.sqrt(np.maximum(spread * weights.sum(), 1e-300))
-    known = turned > _KNOWN * np.median(noise)
-    return gains, np.where(known, 2.0 * noise * np.sqrt(np.maximum(spread, 0.0)), np.inf)
+    # errors of the camera's turns show about an axis that the gyroscope follows; about the others they are as large
+    known = turned > _KNOWN * noise.max()
+    # errors of what a line is fitted over make its slope too small
+    flattened = (noise.max() / np.maximum(turned, 1e-12)) ** 2
+    return gains, np.where(known, 2.0 * noise * np.sqrt(np.maximum(spread, 0.0)) + flattened / 3, np.inf)
 
 
 def check_axes(fits: Mapping[str, TurnFit]) -> tuple[SensorCheck, ...]:
@@ -50,9 +53,15 @@ def check_axes(fits: Mapping[str, TurnFit]) -> tuple[SensorCheck, ...]:
     votes = []
     for fit in fits.values():
         gains, stds = axis_gains(fit)
-        ratio = gains / np.median(gains)
-        known = np.abs(ratio - 1) > np.maximum(_GAIN, _SIGMAS * stds)
-        votes.append(np.where(known, ratio, np.nan))
+        known = np.isfinite(stds)
+        if known.sum() < 2:
+            continue
+        # of two, nobody knows which is wrong: that of the turns' scale is right
+        usual = float(np.median(gains[known])) if known.all() else 1.0
+        off = known & (np.abs(gains / usual - 1) > np.maximum(_GAIN, _SIGMAS * stds))
+        votes.append(np.where(off, gains / usual, np.nan))
+    if not votes:
+        return ()
     told = np.array(votes)
     axis = int(np.argmax(np.isfinite(told).sum(axis=0)))
     wrong = told[np.isfinite(told[:, axis]), axis]

@@ -12,6 +12,8 @@ from rigwake.recording import GnssStream
 _LEAST_STEP_M = 0.05  # below, a vessel that lies still or a coarse last digit repeat a position too
 _WORTH_A_WORD = 0.02  # of the fixes
 _UNKNOWN_HEIGHT_M = 100.0
+_ONE_HEIGHT_M = 1e-3
+_EQUATOR_M, _ECCENTRICITY_2 = 6378137.0, 6.69438e-3  # WGS 84
 
 
 def repeated_rows(gnss: GnssStream) -> NDArray[np.bool_]:
@@ -38,9 +40,11 @@ def never_moves(gnss: GnssStream) -> bool:
 def without_heights(gnss: GnssStream) -> GnssStream | None:
     """The fixes with heights of no weight, where all are one height although the fixes move; else None."""
     p = gnss.position_enu
-    # one number given as degrees and metres comes out of the conversion as a height on a bowl: a plane's curvature
-    bowl = (p[:, 0] ** 2 + p[:, 1] ** 2) / (2 * 6.37e6)
-    if len(p) < 2 or np.ptp(p[:, 2] + bowl) > 1e-4 or not np.ptp(p[:, :2], axis=0).any():
+    # one height above the ellipsoid lies below the tangent plane by its curvature
+    bent = 1 - _ECCENTRICITY_2 * np.sin(np.deg2rad(gnss.origin_lla[0])) ** 2
+    east, north = _EQUATOR_M / np.sqrt(bent), _EQUATOR_M * (1 - _ECCENTRICITY_2) / bent**1.5
+    below = p[:, 0] ** 2 / (2 * east) + p[:, 1] ** 2 / (2 * north)
+    if len(p) < 2 or np.ptp(p[:, 2] + below) > _ONE_HEIGHT_M or not np.ptp(p[:, :2], axis=0).any():
         return None
     covariances = gnss.covariances.copy()
     covariances[:, 2, :] = covariances[:, :, 2] = 0.0

@@ -209,6 +209,8 @@ def check_mounts(fits: Mapping[str, TurnFit]) -> tuple[SensorCheck, ...]:
         if change is not None:
             changes[name] = change
     partners = _exchanged(changes)
+    if len(changes) > 1 and len(changes) == len(fits) and not partners:
+        return (_moved_imu(fits, changes, quantity),)
     checks = []
     for name, change in changes.items():
         at = (change.at_ns - int(fits[name].start_ns[0])) * 1e-9
@@ -232,6 +234,21 @@ def check_mounts(fits: Mapping[str, TurnFit]) -> tuple[SensorCheck, ...]:
             )
         )
     return tuple(checks)
+
+
+def _moved_imu(fits: Mapping[str, TurnFit], changes: Mapping[str, MountChange], quantity: str) -> SensorCheck:
+    """Where every camera's mounting seems to change, it is what all are compared with."""
+    told = ", ".join(
+        f"{name} by {np.rad2deg(change.knock or change.turned):.2f} deg at "
+        f"{(change.at_ns - int(fits[name].start_ns[0])) * 1e-9:.1f} s"
+        for name, change in changes.items()
+    )
+    words = (
+        f"no camera keeps its mounting against it ({told}): it moved, or one axis of its gyroscope is wrong."
+    )
+    remedy = "Fix its mount; check the scale and range of every axis of the gyroscope."
+    size = float(np.rad2deg(np.median([change.turned for change in changes.values()])))
+    return SensorCheck("imu", False, size, float(np.rad2deg(_TURNED)), words, remedy, quantity)
 
 
 def _exchanged(changes: Mapping[str, MountChange]) -> dict[str, str]:
