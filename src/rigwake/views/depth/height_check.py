@@ -30,7 +30,9 @@ _AROUND_PX = 1.4  # standard deviation of the window
 _FEW = 1.0  # points per pixel that say as much as nothing
 _STANDS = 0.35  # balance from which a pixel stands on what is under it
 _LEAST_PX = 8  # of a thing on the water
-_SURE, _POSSIBLE = 1.0, -1.6  # nats by looks alone, mean over a thing: without and with support by height
+# nats by looks alone, mean over a thing: without support by height, with some, and with much
+_SURE, _LIKELY, _POSSIBLE = 1.0, 0.3, -1.6
+_SOME = 0.4  # points per pixel over the plane
 _SUPPORTED, _SUPPORTED_PX = 0.25, 4  # share of a thing's pixels that stand, and their least number
 _STRONG = 1.5  # points per pixel over the plane
 _FOOT = 0.8  # of points in the plane, for each over it, right below a thing
@@ -167,7 +169,9 @@ def without_ghosts(labels: Labels, looks: Labels, evidence: PlaneEvidence, grid:
     )
     odds = np.log(np.maximum(looks.probability, 1e-4))
     mean_odds = total(odds[OBSTACLE] - odds[WATER]) / area
-    likely = (mean_odds > _SURE) & ~unmatched | (mean_odds > _POSSIBLE) & supported
+    over, under = total(evidence.over), total(evidence.under)
+    partly = (over > _SOME * area) & (under < over)
+    likely = (mean_odds > np.where(partly, _LIKELY, _SURE)) & ~unmatched | (mean_odds > _POSSIBLE) & supported
     likely &= area >= _LEAST_PX
     likely[0], afloat[0] = True, False
     nats = np.where(likely, np.where(supported, _BOTH_NATS, _LOOKS_NATS), -_LOOKS_NATS)
