@@ -203,12 +203,11 @@ def random_thing(rng: np.random.Generator, atlas: Atlas) -> tuple[Mesh, float]:
 
 def _scene(rng: np.random.Generator, number: int) -> tuple[Scene, Sea, Weather]:
     layout = str(rng.choice(["harbour", "bay", "canal", "marina"]))
-    near, middle, open_water = (30.0, 50.0), (50.0, 140.0), (140.0, 260.0)
-    width = rng.uniform(*(near, middle, open_water)[int(rng.choice(3, p=[0.4, 0.3, 0.3]))])
-    length = rng.uniform(max(40.0, 0.7 * width), max(150.0, 1.3 * width))
+    narrow = rng.random() < 0.5
+    width = rng.uniform(30, 50) if narrow else rng.uniform(50, 140)
     scene = Scene(
         layout=layout,  # type: ignore[arg-type]
-        size_m=(float(length), float(width)),
+        size_m=(float(rng.uniform(40, 150)), float(width)),
         density=float(rng.uniform(0.3, 1.5)),
         seed=number,
     )
@@ -289,8 +288,6 @@ def render_scene(number: int, step_deg: tuple[float, float] = (0.14, 0.5)) -> Pi
         water = renderer.water(float(rng.uniform(0, 60)))
         for _ in range(_HEADINGS):
             step = float(np.exp(rng.uniform(*np.log(step_deg))))
-            if rng.random() < 0.4:  # about that of a level strip
-                step = float(rng.uniform(0.34, 0.46))
             grid = StripGrid(step, float(rng.uniform(0.2, 0.62)) * ROWS * step, ROWS)
             view = rectangle_view(grid, COLUMNS)
             tilt = so3.exp(np.deg2rad([rng.normal(0, 0.8), rng.normal(0, 0.8), 0.0]))

@@ -253,14 +253,16 @@ def height_rows(name: str, seen: Sequence[Seen], rig: SurroundRig) -> list[str]:
     """Estimated height above the water."""
     shots = [s.shot for s in seen]
     true = float(np.mean([s.attitude.height_m for s in shots]))
+    hulls = shots[0].hulls
     try:
-        found = estimate_height(rig, [s.frame_set(rig) for s in shots], KnownTilt(shots))  # type: ignore[arg-type]
+        found = estimate_height(rig, [s.frame_set(rig) for s in shots], KnownTilt(shots), hulls)  # type: ignore[arg-type]
     except EstimationError as error:
         return [f"{name:8}{true:8.3f}  {error.cause}"]
     off = found.height_m / true - 1
     return [
         f"{name:8}{true:8.3f}{found.height_m:8.3f}{100 * off:8.1f}%{100 * found.std_m / true:8.1f}%"
         f"{abs(found.height_m - true) / found.std_m:8.2f}{found.contacts:8d}"
+        f"  {'ripples' if found.by_ripples else 'waterlines'}"
     ]
 
 

@@ -58,11 +58,9 @@ def repaint(
         amount = rng.uniform(0.4, 1.0)
         light[sky] = ((1 - amount) * light + amount * cloud * np.array([0.9, 0.95, 1.0]))[sky]
     if (
-        rng.random() < 0.35
+        rng.random() < 0.25
     ):  # the glitter path of the sun: specks, wider and longer than high the nearer they are
         light = light + glitter(rng, shape, water)[..., None] * sky_light.mean() * rng.uniform(2, 25)
-    if rng.random() < 0.3:
-        light = mirrored(light.astype(np.float32), labels, rng)
     if rng.random() < 0.25:  # foam and wakes: long across, thin down
         foam = smooth_noise(rng, shape, (int(rng.integers(20, 70)), int(rng.integers(4, 16))))
         foam = foam + 0.7 * smooth_noise(rng, shape, (80, 70))
@@ -127,38 +125,6 @@ def glitter(rng: np.random.Generator, shape: tuple[int, int], water: np.ndarray)
     return (lit * path * water).astype(np.float32)
 
 
-def mirrored(light: np.ndarray, labels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The same picture on water that mirrors what stands above it more clearly, darker, and broken by ripples."""
-    rows, columns = labels.shape
-    is_water = labels == WATER
-    foot = np.where(is_water.any(axis=0), np.argmax(is_water, axis=0), rows)
-    stretch = rng.uniform(0.8, 2.5)
-    down = np.arange(rows)[:, None] - foot[None, :]
-    noise = smooth_noise(rng, labels.shape, (int(rng.integers(20, 90)), int(rng.integers(5, 60))))
-    from_row = foot[None, :] - 1 - down / stretch + noise * rng.uniform(0, 0.12) * np.maximum(down, 0)
-    from_column = np.arange(columns)[None, :] + noise * rng.uniform(0, 3)
-    image = cv2.remap(
-        light, from_column.astype(np.float32), from_row.clip(0, rows - 1).astype(np.float32), cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )  # fmt: skip
-    strength = rng.uniform(0.2, 0.9) * np.exp(-np.maximum(down, 0) / rows * rng.uniform(0, 6))
-    amount = np.where(is_water & (down >= 0), strength, 0)[..., None]
-    return (light * (1 - amount) + amount * image * rng.uniform(0.25, 1.0)).astype(np.float32)
-
-
-def seamed(
-    picture: np.ndarray, labels: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """The picture and labels as of two cameras side by side: another brightness, and things shifted by the parallax."""
-    rows, columns = labels.shape
-    at = rng.uniform(0, columns) + rng.uniform(-0.5, 0.5) * (np.arange(rows) - rows / 2)
-    right = np.arange(columns)[None, :] > at[:, None]
-    shift = int(rng.integers(-8, 9))
-    gain = np.exp(rng.normal(0, 0.15)) * np.exp(rng.normal(0, 0.04, 3))
-    other = np.clip(np.roll(picture, shift, axis=1) * gain, 0, 255).astype(np.uint8)
-    return np.where(right[..., None], other, picture), np.where(right, np.roll(labels, shift, axis=1), labels)
-
-
 def photograph(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """An 8-bit BGR picture by a random camera: exposure, white balance, response, saturation, blur, noise, JPEG."""
     rows, columns = light.shape[:2]
@@ -199,8 +165,7 @@ def cut_out(stored: dict[str, np.ndarray], k: int, rng: np.random.Generator) -> 
     """A window of picture `k` anywhere, zoomed to the size that is trained on: where something lies in the picture must
     not tell what it is. Light, ranges, labels, and elevations (ROWS,) in degrees."""
     rows, columns = stored["labels"].shape[1:]
-    most = 2.2 if rng.random() < 0.6 else 1.1
-    zoom = float(np.exp(rng.uniform(np.log(_ROWS / rows), np.log(most))))
+    zoom = float(np.exp(rng.uniform(np.log(_ROWS / rows), np.log(2.2))))
     high, wide = _ROWS / zoom, min(_COLUMNS / zoom, columns)
     top, left = rng.uniform(0, rows - high), rng.uniform(0, columns - wide)
     r = np.clip((top + (np.arange(_ROWS) + 0.5) / zoom).astype(int), 0, rows - 1)
@@ -239,8 +204,6 @@ class Examples:
         if rng.random() < 0.5:
             light, ranges, labels = set_afloat(light, ranges, labels, rng)
         picture = photograph(repaint(light, ranges, labels, rng), rng)
-        if rng.random() < 0.3:
-            picture, labels = seamed(picture, labels, rng)
         elevation = elevation + rng.normal(0, 0.8)
         rows, columns = labels.shape
         weight = np.ones(labels.shape, np.float32)
@@ -260,10 +223,7 @@ class Examples:
             labels[~is_seen] = IGNORED
         if rng.random() < 0.5:
             picture, labels, is_seen, weight = (a[:, ::-1].copy() for a in (picture, labels, is_seen, weight))
-        channels = network_input(picture, is_seen, None if rng.random() < 0.4 else elevation)
-        # a strip goes all around: its mean and deviation are not those of a window of it
-        stretch, shifted = np.exp(rng.normal(0.0, 0.35)), rng.normal(0.0, 0.35)
-        channels[:3] = (channels[:3] * stretch + shifted) * is_seen
+        channels = network_input(picture, is_seen, None if rng.random() < 0.5 else elevation)
         return channels, labels.astype(np.int64), weight
 
 

@@ -16,6 +16,7 @@ from rigwake.views.colour import (
 from rigwake.views.frames import FrameSet, place
 from rigwake.views.height import edges_below_things, height_from_contacts
 from rigwake.views.horizon import horizon_attitude
+from rigwake.views.ripples import height_of_ripples
 from rigwake.views.seam_blame import blame_cameras
 from rigwake.views.seam_report import seams_of
 from rigwake.views.seams import SeamMatches, SeamMeter, overlapping_pairs
@@ -186,3 +187,15 @@ def test_horizon_levels_an_unknown_attitude() -> None:
     assert np.allclose(found.roll_pitch, STAND.roll_pitch, atol=np.deg2rad(0.4))
     flat = {name: np.full((480, 640, 3), 90, np.uint8) for name in RIG.names}
     assert horizon_attitude(flat, RIG, guess) is None
+
+
+def test_the_height_on_which_ripples_agree() -> None:
+    rng = np.random.default_rng(4)
+    surface, mirrored = 2.1 + rng.normal(0, 0.1, 5000), rng.uniform(0.4, 12.0, 5000)
+    height, points = height_of_ripples(np.concatenate([surface, mirrored]))
+    assert height == pytest.approx(2.1, rel=0.02)
+    assert 3500 < points < 6500
+    with pytest.raises(EstimationError, match="one height"):
+        height_of_ripples(np.concatenate([surface, 1.6 * surface[:4000]]))
+    with pytest.raises(EstimationError, match="too little"):
+        height_of_ripples(surface[:800])

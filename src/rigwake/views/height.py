@@ -1,6 +1,7 @@
-"""How high the cameras are above the water: from waterlines of things whose distance two cameras measure.
+"""How high the cameras are above the water: from its ripples, or from waterlines of things whose distance is known.
 
-A calibration does not hold it. Where an upright thing at the horizontal distance D touches the water, its waterline is
+A calibration does not hold it. Ripples that two cameras match tell it best (`ripples`); where the water is too smooth
+or too far away, waterlines do. Where an upright thing at the horizontal distance D touches the water, its waterline is
 seen at the depression `delta` from the viewpoint, and the height is `D tan(delta)`. Which level edge is a waterline is
 not known beforehand: every level edge below something whose distance two cameras agree on votes, and only waterlines
 agree on one height whatever their distance. Edges of wet stripes and of mirror images vote beside it; that is why the
@@ -10,7 +11,7 @@ standard deviation is never below 12 per cent. Waterlines that are known to be s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -22,6 +23,7 @@ from rigwake.errors import EstimationError
 from rigwake.views.attitude import LevelAttitude
 from rigwake.views.frames import FrameSet
 from rigwake.views.levelling import Leveller
+from rigwake.views.ripples import RIPPLES_STD, height_of_ripples, ripple_heights
 from rigwake.views.strips import StripGrid, camera_strips
 from rigwake.views.surface import Shell
 from rigwake.views.surround_rig import SurroundRig
@@ -44,26 +46,39 @@ _UNKNOWN_EDGES_STD = 0.12  # relative: which edge the mode stands for; measured 
 @dataclass(frozen=True)
 class HeightEstimate:
     """Height of the viewpoint (mean of the cameras) above the mean water, its standard deviation, and the number of
-    waterlines it comes from (0: given)."""
+    waterlines, or of points on ripples, it comes from (0: given)."""
 
     height_m: float
     std_m: float
     contacts: int
+    by_ripples: bool = False
 
 
-def estimate_height(rig: SurroundRig, samples: Sequence[FrameSet], leveller: Leveller) -> HeightEstimate:
-    """The height that most level edges agree on. Raises EstimationError if none stands out."""
-    distances, depressions = [], []
+def estimate_height(
+    rig: SurroundRig,
+    samples: Sequence[FrameSet],
+    leveller: Leveller,
+    masks: Mapping[str, Mask] | None = None,
+) -> HeightEstimate:
+    """The height that most ripples agree on, else the one that most waterlines agree on.
+
+    masks: of the own vessel, by camera name. Raises EstimationError if neither stands out.
+    """
     usable = [frames for frames in samples if (~frames.is_missing).sum() > 1]
-    for frames in usable[:: max(len(usable) // _SETS, 1)][:_SETS]:
-        images = frames.images(rig)
-        distance, depression = edges_below_things(images, rig, leveller.at(frames.timestamp_ns, images))
-        distances.append(distance)
-        depressions.append(depression)
-    if not distances:
+    chosen = usable[:: max(len(usable) // _SETS, 1)][:_SETS]
+    if not chosen:
         raise EstimationError("No two cameras have pictures.")
-    found = height_from_contacts(np.concatenate(distances), np.concatenate(depressions))
-    tilt = leveller.at(usable[0].timestamp_ns, usable[0].images(rig)).tilt_std
+    seen = [(images, leveller.at(f.timestamp_ns, images)) for f in chosen if (images := f.images(rig))]
+    tilt = seen[0][1].tilt_std
+    try:
+        heights = [ripple_heights(images, rig, attitude, masks) for images, attitude in seen]
+        height, points = height_of_ripples(np.concatenate(heights))
+    except EstimationError:
+        pass
+    else:
+        return HeightEstimate(height, height * float(np.hypot(RIPPLES_STD, tilt / 0.3)), points, True)
+    edges = [edges_below_things(images, rig, attitude) for images, attitude in seen]
+    found = height_from_contacts(*(np.concatenate([e[k] for e in edges]) for k in (0, 1)))
     std = found.height_m * float(
         np.hypot(_UNKNOWN_EDGES_STD, tilt / 0.2)
     )  # edges are seen about 0.2 rad down

@@ -156,7 +156,7 @@ def prepare_surround(
     notes = [*rig.notes, *notes, *_pairing_notes(rig, samples)]
     colour = _colour(rig, samples, leveller, masks) if options.correct_colours else None
     say("height above the water")
-    height, words = _height(options, rig, samples, leveller, colour)
+    height, words = _height(options, rig, samples, leveller, masks)
     notes += [words] if words else []
     if height is not None:
         leveller = leveller.with_height(height.height_m, height.std_m)
@@ -275,7 +275,7 @@ def _height(
     rig: SurroundRig,
     samples: Sequence[FrameSet],
     leveller: Leveller,
-    colour: ColourModel | None,
+    masks: Mapping[str, Mask],
 ) -> tuple[HeightEstimate | None, str]:
     """The height of the viewpoint above the water, and the sentence that says where it is from."""
     if options.height_m is not None:
@@ -284,12 +284,13 @@ def _height(
         given = HeightEstimate(options.height_m, 0.02 * options.height_m, 0)
         return given, f"Height of the cameras above the water: {options.height_m:g} m, as given."
     try:
-        found = estimate_height(rig, samples, leveller)
+        found = estimate_height(rig, samples, leveller, masks)
     except EstimationError as error:
         return None, f"Height of the cameras above the water: not known. {error.cause}"
+    places = "points on its ripples" if found.by_ripples else "waterlines of what stands in it"
     return found, (
         f"Height of the cameras above the water: {found.height_m:.2f} +- {found.std_m:.2f} m, "
-        f"estimated from {found.contacts} waterlines of what stands in it."
+        f"estimated from {found.contacts} {places}."
     )
 
 

@@ -30,8 +30,13 @@ _AROUND_PX = 1.4  # standard deviation of the window
 _FEW = 1.0  # points per pixel that say as much as nothing
 _STANDS = 0.35  # balance from which a pixel stands on what is under it
 _LEAST_PX = 8  # of a thing on the water
-_SURE, _POSSIBLE = 1.0, -1.6  # nats by looks alone, mean over a thing: without and with support by height
+# nats by looks alone, mean over a thing: without support by height, with some, and with much
+_SURE, _LIKELY, _POSSIBLE = 1.0, 0.3, -1.6
+_SOME = 0.4  # points per pixel over the plane
 _SUPPORTED, _SUPPORTED_PX = 0.25, 4  # share of a thing's pixels that stand, and their least number
+_STRONG = 1.5  # points per pixel over the plane
+_FOOT = 0.8  # of points in the plane, for each over it, right below a thing
+_BOTH_NATS, _LOOKS_NATS = 6.0, 3.0  # of a thing as a whole, with support by height and without
 _SOLID = 0.35  # share of what was tried that must be matched over the plane or in it
 _LARGE_PX = 40  # smaller things are often not matched
 
@@ -136,40 +141,48 @@ def _relabelled(labels: Labels, logarithm: Floats) -> Labels:
 
 
 def without_ghosts(labels: Labels, looks: Labels, evidence: PlaneEvidence, grid: StripGrid) -> Labels:
-    """Labels without pieces of obstacle on open water that are too small or that too little speaks for.
+    """Labels without pieces of obstacle on open water that are too small or that too little speaks for; the others are
+    sure in all their pixels.
 
     looks: the labels before any test by height.
     """
     obstacle = labels.classes == OBSTACLE
     number, count = numbered_around(obstacle)
-    odds = np.log(np.maximum(looks.probability[OBSTACLE], 1e-4) / np.maximum(looks.probability[WATER], 1e-4))
-    flat = number.ravel()
 
-    def total(values: NDArray[np.generic]) -> Array:
-        return np.bincount(flat, np.asarray(values, np.float64).ravel(), count)
+    def total(values: NDArray[np.generic], of: NDArray[np.int32] = number) -> Array:
+        return np.bincount(of.ravel(), np.asarray(values, np.float64).ravel(), count)
 
     area = np.maximum(total(obstacle), 1)
     far = (np.arange(grid.rows) < grid.horizon_row + _BELOW_DEG / grid.step_deg)[:, None]
-    rises = total(obstacle & far) > 0
-    over, near, tried = total(evidence.over), total(evidence.near), total(evidence.tried)
-    unmatched = (area >= _LARGE_PX) & (tried > area) & (over + near < _SOLID * tried)
-    supported = total(evidence.standing()) > np.maximum(_SUPPORTED * area, _SUPPORTED_PX)
-    mean_odds = total(odds) / area
-    likely = (mean_odds > _SURE) & ~unmatched | (mean_odds > _POSSIBLE) & supported
-    ghost = ~rises & ((area < _LEAST_PX) | ~likely)
-    ghost[0] = False
-    gone = ghost[number]
-    if not gone.any():
-        return labels
-    probability = labels.probability.copy()
-    swapped = probability[:, gone]
-    probability[WATER, gone], probability[OBSTACLE, gone] = (
-        np.maximum(swapped[WATER], swapped[OBSTACLE]),
-        np.minimum(swapped[WATER], swapped[OBSTACLE]),
+    afloat = total(obstacle & far) == 0
+    tried, standing = total(evidence.tried), evidence.standing()
+    unmatched = (area >= _LARGE_PX) & (tried > area) & (total(evidence.over + evidence.near) < _SOLID * tried)
+    # right below a thing that stands, the water is matched in its plane
+    below = np.roll(number, 2, axis=0)
+    below[:2] = 0
+    below[obstacle] = 0
+    stands = total(standing)
+    supported = (
+        (stands > np.maximum(_SUPPORTED * area, _SUPPORTED_PX))
+        & (total(np.where(standing, evidence.over, 0)) > _STRONG * stands)
+        & (total(evidence.near, below) > _FOOT * total(evidence.over, below))
     )
-    classes = labels.classes.copy()
-    classes[gone] = WATER
-    return Labels(classes, probability, labels.words)
+    odds = np.log(np.maximum(looks.probability, 1e-4))
+    mean_odds = total(odds[OBSTACLE] - odds[WATER]) / area
+    over, under = total(evidence.over), total(evidence.under)
+    partly = (over > _SOME * area) & (under < over)
+    likely = (mean_odds > np.where(partly, _LIKELY, _SURE)) & ~unmatched | (mean_odds > _POSSIBLE) & supported
+    likely &= area >= _LEAST_PX
+    likely[0], afloat[0] = True, False
+    nats = np.where(likely, np.where(supported, _BOTH_NATS, _LOOKS_NATS), -_LOOKS_NATS)
+    chosen = afloat[number]
+    if not chosen.any():
+        return labels
+    logarithm = np.log(np.maximum(labels.probability, 1e-4))
+    ratio = logarithm[OBSTACLE] - logarithm[WATER]
+    wanted = np.where(likely[number], np.maximum(ratio, nats[number]), np.minimum(ratio, nats[number]))
+    logarithm[OBSTACLE] += np.where(chosen, wanted - ratio, 0)
+    return _relabelled(labels, logarithm)
 
 
 def numbered_around(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:

@@ -20,6 +20,7 @@ ClassMap = NDArray[np.uint8]
 BELOW_DEG = 1.5  # obstacles are counted this far below the horizon
 _LEAST_DEG = 1.0  # width of an object that must be found
 _FOUND = 0.5  # of an object's pixels
+_EDGE_DEG = 0.8  # an outline that is off by less is an error of the edge, not another object
 DANGER_M = 15.0
 
 
@@ -28,7 +29,8 @@ class LabelMeasures:
     """Of one or several pictures together; NaN where there is nothing to measure.
 
     iou: water, obstacle, sky. water_edge_deg: RMSE over the columns. recall, precision: of obstacle pixels more than
-    1.5 deg below the horizon. objects_found, objects, false_objects: connected pieces there, at least 1 deg wide.
+    1.5 deg below the horizon. objects_found, objects, false_objects: connected pieces there, at least 1 deg wide; false
+    are those of which more than half lies farther than 0.8 deg from every true obstacle.
     f1, f1_danger: of objects, everywhere below the horizon and where the water is nearer than 15 m. pictures: number.
     """
 
@@ -81,15 +83,19 @@ class LabelComparison:
         below = (elevation_deg < -BELOW_DEG)[:, None] & scored
         f, t = (found == OBSTACLE) & below, (truth == OBSTACLE) & below
         self._below += (f & t).sum(), f.sum(), t.sum()
-        self._objects[0] += self._count(f, t, wraps)
+        size = 2 * round(_EDGE_DEG / self.step_deg) + 1
+        around = cv2.dilate((truth == OBSTACLE).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+        self._objects[0] += self._count(f, t, around, wraps)
         if np.isfinite(height_m):
             near = (elevation_deg < -np.rad2deg(np.arctan2(height_m, DANGER_M)))[:, None]
-            self._objects[1] += self._count(f & near, t & near, wraps)
+            self._objects[1] += self._count(f & near, t & near, around, wraps)
         self.pictures += 1
 
-    def _count(self, found: NDArray[np.bool_], truth: NDArray[np.bool_], wraps: bool) -> tuple[int, int, int]:
+    def _count(
+        self, found: NDArray[np.bool_], truth: NDArray[np.bool_], around: NDArray[np.bool_], wraps: bool
+    ) -> tuple[int, int, int]:
         hits, real = self._pieces(truth, found, wraps)
-        right, said = self._pieces(found, truth, wraps)
+        right, said = self._pieces(found, around, wraps)
         return hits, real, said - right
 
     def _pieces(self, pieces: NDArray[np.bool_], other: NDArray[np.bool_], wraps: bool) -> tuple[int, int]:
