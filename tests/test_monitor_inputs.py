@@ -17,6 +17,7 @@ from rigwake.errors import InputError, UnobservableError, UsageError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.logbook.store import Logbook
+from rigwake.monitor.knocks import knocks_inside
 from rigwake.monitor.monitor_report import logged_verdicts, result_to_dict, verdict_line
 from rigwake.monitor.recalibration import recalibrate
 from rigwake.monitor.run import monitor
@@ -96,6 +97,26 @@ def test_numbers_that_the_calibration_lacks(world: Watch) -> None:
     assert list(prepared.rig.cameras) == ["front", "back"]
     assert "left" in prepared.left_out
     assert np.isfinite(prepared.rig.cameras["front"].rig_from_cam.translation).all()
+
+
+def test_a_knock_inside_the_recording_that_was_calibrated(world: Watch) -> None:
+    """Half a degree after 30 s, held against the calibration of the time before."""
+    (sentence,) = knocks_inside(world.calibration, world.recording, world.tracks)
+    assert sentence.startswith("left: it turned on its mount by about 0.")
+    assert "30 to 40 s after the start" in sentence
+    assert "--duration" in sentence
+
+
+def test_standstill_tells_axes_and_what_would_help() -> None:
+    still = watch("standstill", 30.0, hs_m=0.02, cameras=2)
+    result = monitor(still.calibration, still.recording, tracks=still.tracks)
+    assert result.exit_code == 3
+    for verdict in result.verdicts.values():
+        assert verdict.state is CameraState.UNOBSERVABLE
+        assert "the vertical" in verdict.words
+        assert "no way made" in verdict.words
+        assert "what helps: sailing" in verdict.words
+    assert result_to_dict(result)["cues"]["overlap"]["words"] == "overlap: saw nothing"
 
 
 @pytest.mark.slow
