@@ -27,8 +27,8 @@ from rigwake.geometry import so3
 from rigwake.monitor.block_motion import GyroBias
 from rigwake.monitor.change_detection import likelihood_ratios
 from rigwake.monitor.cues import CUES, joint, score_cues, weighted_cues
-from rigwake.monitor.innovations import belief_of, innovations, with_offsets
-from rigwake.monitor.judge import Judgement, judge_cues
+from rigwake.monitor.innovations import Innovations, belief_of, innovations, with_offsets
+from rigwake.monitor.judge import Judgement, joint_claim, judge_cues
 from rigwake.monitor.pair_kernels import MOUNTING
 from rigwake.monitor.rig_motion import rig_motion
 from rigwake.monitor.score import BLOCK_S, BlockScores, join_blocks, score_blocks_with_motion
@@ -94,18 +94,34 @@ class Run:
         return self.changed(-error, 1.0, real=False)
 
     def statistic(self, names: tuple[str, ...]) -> np.ndarray:
-        """(B,) the largest of all cameras, by some of the cues."""
-        scores, thresholds = joint([self.cues[name] for name in names]), Thresholds()
-        belief = belief_of(calibration_of(self.rig), scores.cameras, thresholds)
-        found = innovations(scores, with_offsets(belief, scores.H.shape[1], thresholds), thresholds)
-        return np.asarray(likelihood_ratios(found, thresholds).value.max(axis=1))
+        """(B,) the largest of all cameras by some of the cues; by all of them as it counts: where the motion supports
+        what it tells, or else the motion's."""
+        found = self._found(joint([self.cues[name] for name in names]))
+        statistics = likelihood_ratios(found, Thresholds())
+        value = statistics.value.max(axis=1)
+        if names != CUES:
+            return np.asarray(value)
+        motion = self._found(self.alone)
+        alone = likelihood_ratios(motion, Thresholds()).value.max(axis=1)
+        for k in np.flatnonzero(value > alone):
+            if not joint_claim(found, motion, statistics, int(k), self.places, Thresholds()):
+                value[k] = alone[k]
+        return np.asarray(np.maximum(value, alone))
+
+    def _found(self, scores: BlockScores) -> Innovations:
+        belief = belief_of(calibration_of(self.rig), scores.cameras, Thresholds())
+        return innovations(scores, with_offsets(belief, scores.H.shape[1], Thresholds()), Thresholds())
+
+    @property
+    def places(self) -> dict[str, np.ndarray]:
+        """(3,) of every camera on the rig."""
+        return {name: camera.rig_from_cam.translation for name, camera in self.rig.cameras.items()}
 
     def judged(self) -> Judgement:
         """What the monitor says."""
         thresholds = Thresholds()
         belief = belief_of(calibration_of(self.rig), self.alone.cameras, thresholds)
-        places = {name: camera.rig_from_cam.translation for name, camera in self.rig.cameras.items()}
-        return judge_cues(joint(list(self.cues.values())), self.alone, belief, places, thresholds)
+        return judge_cues(joint(list(self.cues.values())), self.alone, belief, self.places, thresholds)
 
 
 def scored_watch(
@@ -138,8 +154,7 @@ def false_alarms(motion: str, runs: list[Run]) -> None:
         run = run.with_errors(seed)
         judgement = run.judged()
         alarms += len(judgement.alarms)
-        # the decision needs the support of the motion, too: the statistics alone are an upper bound
-        value = np.maximum(judgement.statistics.value.max(axis=1), run.statistic(CUES))
+        value = run.statistic(CUES)
         marks += [float(part.max()) for part in np.array_split(value, max(len(value) // 30, 1))]
         states += [state for row in judgement.standings[12:] for state in row]
     hours = sum(len(run.alone) for run in runs) * BLOCK_S / 3600
@@ -236,11 +251,10 @@ def not_blamed(run: Run) -> None:
         "IMU knocked by 0.5 deg": part.changed(imu, since),
         "clock jumps by 20 ms": part.changed(clock, since),
     }
-    list_deg = np.where(since > 0, 1.0, 0.0)
-    gravity = (
-        so3.exp(np.deg2rad(list_deg)[:, None] * np.array([1.0, 0, 0])) @ part.alone.gravity[:, :, None]
-    )[:, :, 0]
-    rows["the boat lists by 1 deg"] = replace(part, alone=replace(part.alone, gravity=gravity))
+    whole = run.with_errors(3)
+    lists = np.deg2rad(np.arange(len(whole.alone)) >= len(whole.alone) // 2)
+    gravity = so3.exp(lists[:, None] * np.array([1.0, 0, 0])) @ whole.alone.gravity[:, :, None]
+    rows["the boat lists by 1 deg"] = replace(whole, alone=replace(whole.alone, gravity=gravity[:, :, 0]))
     for what, changed in rows.items():
         tell(f"eights, {what}", changed)
 

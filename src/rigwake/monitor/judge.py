@@ -179,23 +179,43 @@ def _first_alarm(
     return alarm
 
 
+def joint_claim(
+    found: Innovations,
+    alone: Innovations,
+    statistics: BlockStatistics,
+    block: int,
+    places: Mapping[str, Array],
+    thresholds: Thresholds,
+) -> list[Explanation]:
+    """What all cues together say of the camera that turned or shifted by a block, the likeliest first; empty if it is
+    not clear, or the motion alone does not support it.
+
+    found, statistics: of all cues together; alone: of the motion.
+    """
+    worst = int(np.argmax(statistics.value[block]))
+    since, steady = int(statistics.first[block, worst]), bool(statistics.steady[block, worst])
+    explanations = explain(found, since, block, places, steady=steady)
+    best = explanations[0]
+    if best.cause not in ("rotation", "translation"):
+        return []
+    if best.evidence - explanations[1].evidence < thresholds.margin:
+        return []
+    supported = support(best, explain(alone, since, block, places, steady=steady)) >= thresholds.support
+    return explanations if supported else []
+
+
 def _joint_alarm(
     found: Innovations, alone: Innovations, places: Mapping[str, Array], thresholds: Thresholds
 ) -> Alarm | None:
-    """The first block in which all cues together tell that a camera turned or shifted, and the motion alone agrees."""
+    """The first alarm of all cues together."""
     statistics = likelihood_ratios(found, thresholds)
     for block in np.flatnonzero((statistics.value >= thresholds.alarm).any(axis=1)).tolist():
-        worst = int(np.argmax(statistics.value[block]))
-        since, steady = int(statistics.first[block, worst]), bool(statistics.steady[block, worst])
-        explanations = explain(found, since, block, places, steady=steady)
+        explanations = joint_claim(found, alone, statistics, block, places, thresholds)
+        if not explanations:
+            continue
         best = explanations[0]
-        if best.cause not in ("rotation", "translation"):
-            continue
-        if best.evidence - explanations[1].evidence < thresholds.margin:
-            continue
-        if support(best, explain(alone, since, block, places, steady=steady)) < thresholds.support:
-            continue
         if best.cause == "translation":
+            since = int(statistics.first[block, int(np.argmax(statistics.value[block]))])
             return Alarm(block, since, "", tuple(explanations))
         change = fit_change(found, found.scores.cameras.index(best.camera), len(found.scores) - 1)
         return Alarm(block, change.block, best.camera, tuple(explanations), change)
