@@ -352,6 +352,6 @@ def _drift(
         change.kind,
         change.rate_deg_per_hour,
     )
-    size, std = verdict.size_deg or 0.0, verdict.size_std_deg or 0.0
+    size, sigma = verdict.size_deg or 0.0, verdict.size_std_deg or 0.0
     rate = change.rate_deg_per_hour if change.kind == "ramp" else None
-    return replace(verdict, words=drift_words(size, std, axes @ rotation, rate))
+    return replace(verdict, words=drift_words(size, sigma, axes @ rotation, rate))
