@@ -27,11 +27,11 @@ from rigwake.pipeline.camera_stage import (
     outcome_file,
     process_camera,
 )
-from rigwake.pipeline.outputs import horizon_pixels
 from rigwake.pipeline.prior import RigPrior, load_prior
 from rigwake.pipeline.stage_files import StageLedger, stage_key
 from rigwake.pipeline.stream_selection import select
 from rigwake.recording import AttitudeStream, CameraStream
+from rigwake.report.picture_overlays import horizon_pixels
 from rigwake.simulation.tracks_only import SimulatedTracks
 
 

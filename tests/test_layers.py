@@ -43,10 +43,10 @@ LAYERS = [
     ["simulation"],
     ["exporters"],
     ["report"],
-    ["config"],
-    ["pipeline"],
     ["logbook"],  # the history of a vessel
     ["monitor"],
+    ["config"],
+    ["pipeline"],
     ["views"],
     ["fleet"],  # many recordings, on one machine or a cluster
     ["ros"],  # a node on board; imported by the command line alone

@@ -56,10 +56,11 @@ from rigwake.odometry.gyro import align_gyro
 from rigwake.odometry.imu_alignment import align_inertial
 from rigwake.odometry.metric import metric_start
 from rigwake.odometry.thesis_odometry import estimate_thesis
-from rigwake.pipeline.outputs import horizon_of_image, horizon_pixels, write_trajectories
+from rigwake.pipeline.outputs import horizon_of_image, write_trajectories
 from rigwake.pipeline.stage_files import StageLedger, stage_key
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.report.extrinsics import directions, looks
+from rigwake.report.picture_overlays import horizon_pixels
 from rigwake.report.reduce import summarise_residuals
 from rigwake.rig import Rig, RigCamera
 from rigwake.sync import angular_speed

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,10 +18,12 @@ from rigwake.errors import InputError, UnobservableError, UsageError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.logbook.store import Logbook
+from rigwake.monitor.knocks import knocks_inside
 from rigwake.monitor.monitor_report import logged_verdicts, result_to_dict, verdict_line
-from rigwake.monitor.recalibration import recalibrate
+from rigwake.monitor.recalibration import _shift, recalibrate
 from rigwake.monitor.run import monitor
 from rigwake.monitor.states import CameraState
+from rigwake.monitor.thresholds import Thresholds
 from rigwake.monitor.vessel_rig import prepare_rig
 from rigwake.simulation.track_stream import MountFault
 
@@ -98,6 +101,26 @@ def test_numbers_that_the_calibration_lacks(world: Watch) -> None:
     assert np.isfinite(prepared.rig.cameras["front"].rig_from_cam.translation).all()
 
 
+def test_a_knock_inside_the_recording_that_was_calibrated(world: Watch) -> None:
+    """Half a degree after 30 s, held against the calibration of the time before."""
+    (sentence,) = knocks_inside(world.calibration, world.recording, world.tracks)
+    assert sentence.startswith("left: it turned on its mount by about 0.")
+    assert "30 to 40 s after the start" in sentence
+    assert "--duration" in sentence
+
+
+def test_standstill_tells_axes_and_what_would_help() -> None:
+    still = watch("standstill", 30.0, hs_m=0.02, cameras=2)
+    result = monitor(still.calibration, still.recording, tracks=still.tracks)
+    assert result.exit_code == 3
+    for verdict in result.verdicts.values():
+        assert verdict.state is CameraState.UNOBSERVABLE
+        assert "the vertical" in verdict.words
+        assert "no way made" in verdict.words
+        assert "what helps: sailing" in verdict.words
+    assert result_to_dict(result)["cues"]["overlap"]["words"] == "overlap: saw nothing"
+
+
 @pytest.mark.slow
 def test_from_alarm_to_new_calibration_and_logbook(world: Watch, tmp_path: Path) -> None:
     result = monitor(world.calibration, world.recording, tracks=world.tracks)
@@ -118,6 +141,7 @@ def test_from_alarm_to_new_calibration_and_logbook(world: Watch, tmp_path: Path)
     error = turn - np.deg2rad([0.3, 0, 0.4])
     assert np.rad2deg(np.linalg.norm(error)) < 0.1
     assert error @ np.linalg.solve(found.covariance, error) < 20
+    assert not found.shift.any()  # it turned about its optical centre
     save_calibration(found.calibration, tmp_path / "new.yaml")
     again = load_calibration(tmp_path / "new.yaml")
     with Logbook(tmp_path / "vessel.db", create=True) as book:
@@ -132,6 +156,22 @@ def test_from_alarm_to_new_calibration_and_logbook(world: Watch, tmp_path: Path)
     assert after.verdicts["front"].state in (CameraState.OK, CameraState.UNOBSERVABLE)
     with pytest.raises(UsageError, match="blamed"):
         recalibrate(world.calibration, replace(result, verdicts={"front": result.verdicts["front"]}))
+
+
+def test_a_shift_is_measured_where_the_motion_shows_it(world: Watch) -> None:
+    """Along the bow after minutes of figure eights; along other directions the place stays."""
+    scores = world.scores()
+    many = scores.take(np.tile(np.arange(1, 3), 20))  # before the camera moved, as often as needed
+    known = SimpleNamespace(
+        monitored=prepare_rig(world.calibration, world.recording), thresholds=Thresholds()
+    )
+    at = many.columns(1, 1)
+    moved = replace(many, g=0.08 * many.H[:, :, at.start])
+    found = _shift(moved, "left", known)  # type: ignore[arg-type]
+    assert found is not None
+    assert abs(found.shift[0] - 0.08) < 0.01  # what lies along unseen directions stays out
+    assert found.directions.shape[1] < 3 or np.linalg.norm(found.shift[1:]) < 0.03
+    assert _shift(replace(many, g=0 * many.g), "left", known) is None  # type: ignore[arg-type]
 
 
 def test_truncated_and_empty_calibrations_exit_with_one(tmp_path: Path, world: Watch) -> None:

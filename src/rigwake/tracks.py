@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -32,6 +33,47 @@ class TrackingReport:
     tracks: int
     observations: int
     frames_per_second: float
+
+
+@dataclass(frozen=True, eq=False)
+class CrossViews:
+    """M points that one camera tracked for about a second and another one saw, too.
+
+    source, target: (M,) indices into `cameras`. first_ns, later_ns: (M,) when the source saw it, its clock. seen_ns:
+    (M,) when the target did, its clock. first, later, seen: (M, 3) bearings in the frames of these cameras. std: (M, 3)
+    radians of the three. cluster: (M,) which track of all.
+    """
+
+    cameras: tuple[str, ...]
+    source: Indices
+    target: Indices
+    first_ns: Indices
+    later_ns: Indices
+    seen_ns: Indices
+    first: Array
+    later: Array
+    seen: Array
+    std: Array
+    cluster: Indices
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def take(self, index: Indices) -> CrossViews:
+        """The chosen views."""
+        return take_rows(self, index, keep=("cameras",))
+
+    @classmethod
+    def nothing(cls, cameras: tuple[str, ...]) -> CrossViews:
+        """Of cameras that see nothing in common."""
+        none, empty = np.empty(0, dtype=np.int64), np.empty((0, 3))
+        return cls(cameras, none, none, none, none, none, empty, empty, empty, empty, none)
+
+    def rig_times_ns(self, offsets_s: Mapping[str, float]) -> tuple[Indices, Indices, Indices]:
+        """(M,) times of the three sightings on the rig's clock. offsets_s: of the cameras' clocks."""
+        offsets = np.array([round(offsets_s[name] * 1e9) for name in self.cameras], dtype=np.int64)
+        source, target = offsets[self.source], offsets[self.target]
+        return self.first_ns + source, self.later_ns + source, self.seen_ns + target
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,6 +41,8 @@ def command(
     require_writable("-o", new)
     require_writable("--log", log)
     require_writable("--json", json_file)
+    import numpy as np
+
     from rigwake.calibration import load_calibration, save_calibration
     from rigwake.calibration.yaml_file import plain
     from rigwake.errors import UsageError
@@ -61,8 +63,7 @@ def command(
     save_calibration(found.calibration, new)
     difference = compare_calibrations(old, found.calibration, [20.0])[found.camera]
     if log is not None:
-        since = result.verdicts[found.camera].since_ns
-        assert since is not None
+        since = found.since_ns
         with Logbook(log, create=True) as book:
             if book.find(old) is None:
                 begin = min(int(c.timestamps_ns[0]) for c in opened.cameras.values() if len(c))
@@ -73,8 +74,10 @@ def command(
         write_json(json_file, plain(content))
     if str(json_file) == "-":
         return
+    size = 100 * float(np.linalg.norm(found.shift))
+    shifted = f" and shifted by {size:.1f} cm" if size else ""
     out.print(
-        f"{found.camera}: turned by {difference.rotation_deg:.3f} deg against {calibration.name}, "
+        f"{found.camera}: turned by {difference.rotation_deg:.3f} deg{shifted} against {calibration.name}, "
         f"measured from {10 * found.blocks} s; all other cameras are unchanged.",
         soft_wrap=True,
         markup=False,

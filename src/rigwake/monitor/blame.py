@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -70,10 +70,10 @@ def explain(
     g = scores.g[first : last + 1].sum(axis=0) - H @ believed.mean
     weight = scores.rows[first : last + 1] + 1e-9
     inflation = (scores.inflation[first : last + 1] * weight).sum(axis=0) / weight.sum(axis=0)
-    spread = np.sqrt(np.repeat(inflation, MOUNTING))
+    spread = np.sqrt(scores.by_column(inflation))
     V = H * np.outer(spread, spread) + H @ believed.covariance @ H.T
     explanations = []
-    for cause, camera, P, sizes in _causes(scores.cameras, places):
+    for cause, camera, P, sizes in _causes(scores.cameras, places, len(g)):
         if camera and whole_rig:
             continue
         explanations.append(_weigh(cause, camera, P, sizes, H, g, V))
@@ -81,9 +81,10 @@ def explain(
     return explanations
 
 
-def _causes(cameras: tuple[str, ...], places: Mapping[str, Array]) -> list[tuple[Cause, str, Array, float]]:
-    """Cause, camera, directions (7C, k) that it may take, and the size that is thought possible."""
-    size = MOUNTING * len(cameras)
+def _causes(
+    cameras: tuple[str, ...], places: Mapping[str, Array], size: int
+) -> list[tuple[Cause, str, Array, float]]:
+    """Cause, camera, directions (size, k) that it may take, and the size that is thought possible."""
     identity = np.eye(size)
     causes: list[tuple[Cause, str, Array, float]] = []
     imu, clock = np.zeros((size, 3)), np.zeros((size, 1))
@@ -113,6 +114,13 @@ def _weigh(cause: Cause, camera: str, P: Array, size: float, H: Array, g: Array,
     without = np.linalg.pinv(covariance, hermitian=True)
     evidence = 0.5 * float(value @ without @ value - value @ with_change @ value)
     return Explanation(cause, camera, value, covariance, evidence - _PER_UNKNOWN * len(score))
+
+
+def support(claim: Explanation, explanations: Sequence[Explanation]) -> float:
+    """Log likelihood that other scores give a claim's value over no change. explanations: of these scores."""
+    own = next(e for e in explanations if (e.cause, e.camera) == (claim.cause, claim.camera))
+    pull = np.linalg.pinv(own.covariance, hermitian=True) @ claim.value
+    return float(pull @ own.value - 0.5 * pull @ claim.value)
 
 
 def bent_pictures(found: Innovations, first: int, last: int) -> dict[str, float]:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigwake._types import Array
-from rigwake.monitor.innovations import PARTS, Innovations, window_statistic
-from rigwake.monitor.pair_kernels import MOUNTING
+from rigwake.monitor.innovations import PARTS, TRANSLATION, Innovations, window_statistic
 from rigwake.monitor.thresholds import Thresholds
 
 ChangeKind = Literal["step", "ramp"]
 _RAMP_EVIDENCE = 6.0  # log likelihood over a step
 _SEEN = np.deg2rad(5.0) ** -2  # information about a direction that counts at all
+_SEEN_SHIFT = 1.0  # 1 / m^2: less is no information about a shift
 _SETTLED = 6  # blocks since the change that a ramp needs at least
 
 
@@ -64,12 +64,14 @@ def glr(found: Innovations, thresholds: Thresholds, axes: Array | None = None) -
 
     axes: (C, 3, 3), rows, about which a camera's steps are told; the rig's by default.
     """
-    if axes is None:
-        axes = np.tile(np.eye(3), (len(found.scores.cameras), 1, 1))
+    return replace(likelihood_ratios(found, thresholds), std_deg=window_std_deg(found, thresholds, axes))
+
+
+def likelihood_ratios(found: Innovations, thresholds: Thresholds) -> BlockStatistics:
+    """As `glr`, without saying how well steps are seen: infinite standard deviations."""
     scores = found.scores
     shape = len(scores), len(scores.cameras)
     value, first, steady = np.zeros(shape), np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=bool)
-    std = np.full((*shape, 3), np.inf)
     sums = _Sums.of(found)
     for k in range(shape[0]):
         for against in (False, True):
@@ -86,9 +88,19 @@ def glr(found: Innovations, thresholds: Thresholds, axes: Array | None = None) -
             value[k] = np.where(better, largest, value[k])
             first[k] = np.where(better, starts[best], first[k])
             steady[k] = np.where(better, against, steady[k])
+    return BlockStatistics(value, first, steady, np.full((*shape, 3), np.inf))
+
+
+def window_std_deg(found: Innovations, thresholds: Thresholds, axes: Array | None = None) -> Array:
+    """(B, C, 3) of a step over the longest window up to each block, about each camera's axes; infinite where unseen."""
+    shape = len(found.scores), len(found.scores.cameras)
+    if axes is None:
+        axes = np.tile(np.eye(3), (shape[1], 1, 1))
+    std = np.full((*shape, 3), np.inf)
+    for k in range(shape[0]):
         for c in range(shape[1]):
             std[k, c] = step_std_deg(found, c, max(k - thresholds.longest + 1, 0), k, axes[c])
-    return BlockStatistics(value, first, steady, std)
+    return std
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +115,7 @@ class _Sums:
     @classmethod
     def of(cls, found: Innovations) -> _Sums:
         scores = found.scores
-        wide = np.repeat(scores.inflation, MOUNTING, axis=1)
+        wide = scores.by_column(scores.inflation)
         return cls(
             _summed(scores.H),
             _summed(scores.H * wide[:, :, None]),
@@ -147,6 +159,22 @@ def step_std_deg(found: Innovations, camera: int, first: int, last: int, axes: A
     if weak.any():
         std[np.abs(axes @ vectors[:, weak]).max(axis=1) > 0.05] = np.inf
     return np.asarray(std)
+
+
+def shift_std_m(found: Innovations, thresholds: Thresholds) -> Array:
+    """(C, 3) metres: how well the longest window up to the last block sees a shift of each camera, rotation and clock
+    held; infinite where not."""
+    scores, last = found.scores, len(found.scores) - 1
+    std = np.full((len(scores.cameras), 3), np.inf)
+    for camera in range(len(std) if last >= 0 else 0):
+        first = max(last - thresholds.longest + 1, 0)
+        steady = found.steady[last] is not found.belief
+        at = scores.columns(camera, TRANSLATION)
+        if np.linalg.eigvalsh(scores.H[first : last + 1, at, at].sum(axis=0))[0] < _SEEN_SHIFT:
+            continue
+        covariance = window_statistic(found, camera, first, last, steady=steady, part=TRANSLATION)[2]
+        std[camera] = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return std
 
 
 def fit_change(found: Innovations, camera: int, last: int, earliest: int = 0) -> Change:

@@ -82,7 +82,7 @@ def _pairs_of(tracks: Tracks, rig: Rig, begin_ns: int, end_ns: int, stride: int)
     model = mounted.model
     assert model is not None
     on_rig = tracks.timestamps_ns + round(mounted.time_offset_s * 1e9)
-    partner = _partners(on_rig)
+    partner = frame_partners(on_rig)
     starts = np.flatnonzero((on_rig >= begin_ns) & (on_rig < end_ns) & (partner >= 0))[::stride]
     number = np.full(len(on_rig), -1)
     number[starts] = np.arange(len(starts))
@@ -114,7 +114,7 @@ def _pairs_of(tracks: Tracks, rig: Rig, begin_ns: int, end_ns: int, stride: int)
     )
 
 
-def _partners(stamps_ns: Indices) -> Indices:
+def frame_partners(stamps_ns: Indices) -> Indices:
     """(F,) the frame nearest to a second after each, -1 if there is none near."""
     wanted = stamps_ns + round(PAIR_S * 1e9)
     if len(stamps_ns) < 2:

@@ -94,6 +94,14 @@ def belief_of(calibration: Calibration, cameras: tuple[str, ...], thresholds: Th
     return Belief(np.zeros(size), _positive(covariance) + np.diag(floor**2))
 
 
+def with_offsets(belief: Belief, size: int, thresholds: Thresholds) -> Belief:
+    """The same with the offsets of pairs of cameras behind, up to `size` columns, as large as lenses leave them."""
+    known = len(belief.mean)
+    covariance = np.eye(size) * np.deg2rad(thresholds.offset_deg) ** 2
+    covariance[:known, :known] = belief.covariance
+    return Belief(np.concatenate([belief.mean, np.zeros(size - known)]), covariance)
+
+
 def innovations(scores: BlockScores, belief: Belief, thresholds: Thresholds) -> Innovations:
     """Clipped scores of every block against the calibration and against the steady state before it."""
     spread = spreads(scores)
@@ -195,8 +203,10 @@ def _updated(
     H, g = scores.H[block], scores.g[block]
     if not H.any():
         return belief
-    wide = np.sqrt(np.repeat(scores.inflation[block] * spread, MOUNTING))
-    H, g = H / np.outer(wide, wide), g / wide**2
+    wide = float(
+        (scores.inflation[block] * spread).mean()
+    )  # one number: else a steady error would seem to change
+    H, g = H / wide, g / wide
     g = g - H @ belief.mean
     for c in range(len(scores.cameras)):
         at = scores.columns(c)
@@ -211,6 +221,9 @@ def _updated(
     for c in range(len(scores.cameras)):
         turns = scores.columns(c)
         least[turns] = np.maximum(floor**2 - np.diag(covariance)[turns], 0.0)
+    offsets = slice(MOUNTING * len(scores.cameras), None)
+    still = np.deg2rad(thresholds.offset_floor_deg) ** 2
+    least[offsets] = np.maximum(still - np.diag(covariance)[offsets], 0.0)
     return Belief(mean, covariance + np.diag(least))
 
 

@@ -8,9 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigwake._types import Array
-from rigwake.monitor.blame import Explanation, bent_pictures, explain, strong_bend
-from rigwake.monitor.change_detection import BlockStatistics, Change, fit_change, glr
-from rigwake.monitor.innovations import Belief, Innovations, innovations
+from rigwake.monitor.blame import Explanation, bent_pictures, explain, strong_bend, support
+from rigwake.monitor.change_detection import (
+    BlockStatistics,
+    Change,
+    fit_change,
+    glr,
+    likelihood_ratios,
+    shift_std_m,
+)
+from rigwake.monitor.innovations import Belief, Innovations, innovations, with_offsets
 from rigwake.monitor.pair_kernels import MOUNTING
 from rigwake.monitor.score import BlockScores
 from rigwake.monitor.states import CameraState, Standing, next_standing
@@ -45,6 +52,7 @@ class Judgement:
     """standings: per block and camera. statistics: per block and camera. std_deg: (B, C, 3) about each camera's axes.
 
     step: (B, C, 3), step_std: (B, C, 3) rotations by single blocks, rad, rig axes. alarms: in the order of time.
+    shift_std_m: (C, 3) of a shift over the last blocks, rig axes; infinite where the motion does not show it.
     """
 
     scores: BlockScores
@@ -53,6 +61,7 @@ class Judgement:
     step: Array
     step_std: Array
     alarms: tuple[Alarm, ...]
+    shift_std_m: Array
 
     def alarm_of(self, camera: str) -> Alarm | None:
         """The alarm that a camera is blamed for, or that its words are about."""
@@ -62,14 +71,38 @@ class Judgement:
         return None
 
 
+def judge_cues(
+    together: BlockScores,
+    alone: BlockScores,
+    belief: Belief,
+    places: Mapping[str, Array],
+    thresholds: Thresholds,
+    axes: Array | None = None,
+) -> Judgement:
+    """As `judge_blocks` of the motion alone; all cues together may raise its first alarm sooner.
+
+    together: `fuse` of all cues, alone: of the ego-motion. Cues that compare cameras with each other blame none by
+    themselves: the motion must support it. What follows that alarm is judged by the motion alone, since what two
+    cameras saw is lost, and in part wrong, once one of them turned.
+    """
+    found = innovations(together, with_offsets(belief, together.H.shape[1], thresholds), thresholds)
+    sooner = _joint_alarm(found, innovations(alone, belief, thresholds), places, thresholds)
+    judgement = judge_blocks(alone, belief, places, thresholds, axes, sooner=sooner)
+    return replace(judgement, shift_std_m=shift_std_m(found, thresholds))
+
+
 def judge_blocks(
     scores: BlockScores,
     belief: Belief,
     places: Mapping[str, Array],
     thresholds: Thresholds,
     axes: Array | None = None,
+    *,
+    sooner: Alarm | None = None,
 ) -> Judgement:
     """Detection, blame and states of all cameras over all blocks. places: (3,) of the cameras on the rig.
+
+    sooner: an alarm that takes the place of the first one if it is earlier.
 
     What was explained (a camera that moved, a clock that jumped) becomes unknown from the beginning, and the rest is
     judged again: one moved camera must not make others look moved.
@@ -82,6 +115,8 @@ def judge_blocks(
     explained: set[str] = set()
     for _ in range(len(names) + 2):
         alarm = _first_alarm(found, statistics, places, thresholds, explained)
+        if not alarms and sooner is not None and (alarm is None or sooner.block < alarm.block):
+            alarm = sooner
         if alarm is None:
             break
         alarms.append(alarm)
@@ -98,7 +133,8 @@ def judge_blocks(
         merged = _merged(merged, statistics, names, explained)
     step, step_std = _steps(first_found)
     standings = _standings(merged, alarms, names, thresholds)
-    return Judgement(scores, standings, merged, step, step_std, tuple(alarms))
+    seen = shift_std_m(first_found, thresholds)
+    return Judgement(scores, standings, merged, step, step_std, tuple(alarms), seen)
 
 
 def _first_alarm(
@@ -141,6 +177,49 @@ def _first_alarm(
             return Alarm(block, since, "", tuple(explanations))
         alarm = Alarm(block, since, "", tuple(explanations))
     return alarm
+
+
+def joint_claim(
+    found: Innovations,
+    alone: Innovations,
+    statistics: BlockStatistics,
+    block: int,
+    places: Mapping[str, Array],
+    thresholds: Thresholds,
+) -> list[Explanation]:
+    """What all cues together say of the camera that turned or shifted by a block, the likeliest first; empty if it is
+    not clear, or the motion alone does not support it.
+
+    found, statistics: of all cues together; alone: of the motion.
+    """
+    worst = int(np.argmax(statistics.value[block]))
+    since, steady = int(statistics.first[block, worst]), bool(statistics.steady[block, worst])
+    explanations = explain(found, since, block, places, steady=steady)
+    best = explanations[0]
+    if best.cause not in ("rotation", "translation"):
+        return []
+    if best.evidence - explanations[1].evidence < thresholds.margin:
+        return []
+    supported = support(best, explain(alone, since, block, places, steady=steady)) >= thresholds.support
+    return explanations if supported else []
+
+
+def _joint_alarm(
+    found: Innovations, alone: Innovations, places: Mapping[str, Array], thresholds: Thresholds
+) -> Alarm | None:
+    """The first alarm of all cues together."""
+    statistics = likelihood_ratios(found, thresholds)
+    for block in np.flatnonzero((statistics.value >= thresholds.alarm).any(axis=1)).tolist():
+        explanations = joint_claim(found, alone, statistics, block, places, thresholds)
+        if not explanations:
+            continue
+        best = explanations[0]
+        if best.cause == "translation":
+            since = int(statistics.first[block, int(np.argmax(statistics.value[block]))])
+            return Alarm(block, since, "", tuple(explanations))
+        change = fit_change(found, found.scores.cameras.index(best.camera), len(found.scores) - 1)
+        return Alarm(block, change.block, best.camera, tuple(explanations), change)
+    return None
 
 
 def _whole_rig_alarm(

@@ -19,9 +19,9 @@ from rigwake.monitor.run import CameraVerdict, MonitorResult
 from rigwake.monitor.score import BLOCK_S
 from rigwake.monitor.states import CameraState
 from rigwake.monitor.vessel_rig import AXIS_WORDS, camera_axes
-from rigwake.pipeline.outputs import horizon_pixels
 from rigwake.recording import CameraStream, Recording
 from rigwake.report.html_page import html_page
+from rigwake.report.picture_overlays import horizon_pixels
 
 _STYLE = """
 .state.ok { fill: var(--good) } .state.suspect { fill: var(--warn) } .state.drifted { fill: var(--bad) }

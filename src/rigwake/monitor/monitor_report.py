@@ -87,6 +87,10 @@ def result_to_dict(result: MonitorResult) -> dict[str, Any]:
         "exit_code": result.exit_code,
         "cameras": cameras,
         "own_hull": hull,
+        "cues": {
+            name: {"words": cue.words, "statistic": dict(zip(scores.cameras, cue.value.T, strict=True))}
+            for name, cue in result.cues.items()
+        },
         "notes": list(result.notes),
         "alarms": alarms,
         "blocks": blocks,

@@ -14,15 +14,17 @@ from rigwake.errors import EstimationError, UnobservableError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.monitor.change_detection import Change
+from rigwake.monitor.cross_search import find_cross_views
+from rigwake.monitor.cues import CueSeries, cue_series, fuse, score_cues
 from rigwake.monitor.hull_edges import HullCue, hull_cues
 from rigwake.monitor.innovations import belief_of
-from rigwake.monitor.judge import Alarm, Judgement, judge_blocks
+from rigwake.monitor.judge import Alarm, Judgement, judge_cues
 from rigwake.monitor.rig_motion import RigMotion, rig_motion
-from rigwake.monitor.score import BLOCK_S, BlockScores, block_starts, score_blocks
+from rigwake.monitor.score import BLOCK_S, BlockScores, block_starts, score_blocks, score_blocks_with_motion
 from rigwake.monitor.states import CameraState
 from rigwake.monitor.thresholds import Thresholds
-from rigwake.monitor.trim import trim_change
-from rigwake.monitor.vessel_rig import AXIS_REMEDIES, AXIS_WORDS, MonitoredRig, camera_axes, prepare_rig
+from rigwake.monitor.verdict_words import drift_words, rig_notes, shift_words, unobservable_words
+from rigwake.monitor.vessel_rig import MonitoredRig, camera_axes, prepare_rig
 from rigwake.recording import Recording
 from rigwake.rig import Rig
 from rigwake.tracking.front_ends import track_camera
@@ -77,7 +79,7 @@ class CameraVerdict:
 @dataclass(frozen=True, eq=False)
 class MonitorResult:
     """verdicts: by camera. judgement: block by block. notes: in words. monitored: in the IMU's frame. hull: what the
-    own hull says, of the cameras of which a picture of it is kept."""
+    own hull says, of the cameras of which a picture of it is kept. cues: what each of them says for itself."""
 
     verdicts: Mapping[str, CameraVerdict]
     judgement: Judgement
@@ -87,6 +89,7 @@ class MonitorResult:
     notes: tuple[str, ...] = ()
     thresholds: Thresholds = field(default_factory=Thresholds)
     hull: Mapping[str, HullCue] = field(default_factory=dict)
+    cues: Mapping[str, CueSeries] = field(default_factory=dict)
 
     @property
     def exit_code(self) -> int:
@@ -130,12 +133,15 @@ def monitor(
     if len(starts) < _FEWEST_BLOCKS:
         _too_short(len(starts) * BLOCK_S)
     progress("monitor", "scoring", 0.0)
-    scores = score_blocks(tracks, monitored.rig, motion, starts_ns=starts)
+    scores, motions = score_blocks_with_motion(tracks, monitored.rig, motion, starts_ns=starts)
+    progress("monitor", "looking for what two cameras see", 0.3)
+    views = find_cross_views(tracks, monitored.streams, monitored.rig, motion, motions)
+    by_cue = score_cues(scores, motions, views, monitored.rig, motion)
     belief = belief_of(monitored.calibration, scores.cameras, thresholds)
     up = scores.gravity.mean(axis=0)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0.0, 0.0, 1.0])
     axes = camera_axes(monitored.rig, up)
-    judgement = judge_blocks(scores, belief, monitored.places, thresholds, axes)
+    judgement = judge_cues(fuse(by_cue), scores, belief, monitored.places, thresholds, axes)
     progress("monitor", "measuring what moved", 0.8)
     verdicts = {
         name: _verdict(name, judgement, tracks, monitored, motion, axes[k], thresholds)
@@ -144,10 +150,13 @@ def monitor(
     for name, why in monitored.left_out.items():
         verdicts[name] = CameraVerdict(name, CameraState.UNOBSERVABLE, np.full(3, np.inf), why)
     notes += rig_notes(judgement, thresholds)
-    cues = _hull(monitored, starts, hull or {}, thresholds)
-    verdicts, words = with_hull(verdicts, cues, monitored.rig_from_imu.rotation)
+    on_deck = _hull(monitored, starts, hull or {}, thresholds)
+    verdicts, words = with_hull(verdicts, on_deck, monitored.rig_from_imu.rotation)
     notes += words
-    return MonitorResult(verdicts, judgement, monitored, motion, tracks, tuple(notes), thresholds, cues)
+    cues = cue_series(by_cue, belief, thresholds)
+    return MonitorResult(
+        verdicts, judgement, monitored, motion, tracks, tuple(notes), thresholds, on_deck, cues
+    )
 
 
 def _hull(
@@ -301,8 +310,10 @@ def _verdict(
         words = alarm.words if alarm is not None else "disagrees with the other cameras; watch it"
         return CameraVerdict(name, state, std, words, alarm=alarm)
     if state is CameraState.UNOBSERVABLE:
-        return CameraVerdict(name, state, std, unobservable_words(scores, std, k, thresholds))
-    return CameraVerdict(name, state, std, f"to {max(5 * float(std.max()), 0.01):.2f} deg")
+        is_tracked = len(tracks[name]) > 0
+        return CameraVerdict(name, state, std, unobservable_words(scores, std, k, thresholds, is_tracked))
+    shift = shift_words(judgement.shift_std_m[k], thresholds)
+    return CameraVerdict(name, state, std, f"to {max(5 * float(std.max()), 0.01):.2f} deg; {shift}")
 
 
 def _drift(
@@ -341,41 +352,6 @@ def _drift(
         change.kind,
         change.rate_deg_per_hour,
     )
-    return replace(verdict, words=drift_words(verdict, axes @ rotation))
-
-
-def drift_words(verdict: CameraVerdict, about: Array) -> str:
-    """Size, axis, kind. about: (3,) the rotation about `AXIS_WORDS`."""
-    direction = np.abs(about) / max(float(np.linalg.norm(about)), 1e-12)
-    axis = AXIS_WORDS[int(np.argmax(direction))] if direction.max() > 0.9 else "an oblique axis"
-    parts = f"{verdict.size_deg:.2f} ± {verdict.size_std_deg:.2f} deg about {axis}"
-    if verdict.kind == "ramp":
-        return f"{parts}, {verdict.rate_deg_per_hour:.2f} deg per hour (ramp)"
-    return f"{parts} (step)"
-
-
-def unobservable_words(scores: BlockScores, std: Array, camera: int, thresholds: Thresholds) -> str:
-    """Which axes this motion did not show, why, and what would."""
-    recent = slice(max(len(scores) - thresholds.longest, 0), len(scores))
-    if not scores.rows[recent, camera].any():
-        return "nothing tracked: fog, darkness, a covered lens, or no way made"
-    blind = [AXIS_WORDS[a] for a in range(3) if std[a] > thresholds.observable_deg]
-    remedies = list(dict.fromkeys(AXIS_REMEDIES[a] for a in range(3) if std[a] > thresholds.observable_deg))
-    turning = np.rad2deg(float(np.median(scores.turning[recent])))
-    minutes = (recent.stop - recent.start) * BLOCK_S / 60
-    why = f"no turn in {minutes:.0f} min" if turning < 2.0 else "too little motion"
-    return f"about {' and '.join(blind)}: {why}; what helps: {', '.join(remedies)}"
-
-
-def rig_notes(judgement: Judgement, thresholds: Thresholds) -> list[str]:
-    """What concerns the whole rig: causes that no camera is blamed for, and a trim that changed."""
-    notes = [
-        alarm.words for alarm in judgement.alarms if not alarm.camera and not alarm.explanations[0].camera
-    ]
-    trim = trim_change(judgement.scores)
-    if trim is not None:
-        block, degrees = trim
-        imu_too = any(alarm.explanations[0].cause == "imu" for alarm in judgement.alarms)
-        cause = "the IMU turned on its mount" if imu_too else "the boat's trim or list changed"
-        notes.append(f"the level changed by {degrees:.1f} deg after {block * BLOCK_S / 60:.1f} min: {cause}")
-    return notes
+    size, sigma = verdict.size_deg or 0.0, verdict.size_std_deg or 0.0
+    rate = change.rate_deg_per_hour if change.kind == "ramp" else None
+    return replace(verdict, words=drift_words(size, sigma, axes @ rotation, rate))

@@ -15,38 +15,30 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from rigwake._robust import MAD_TO_STD
 from rigwake._tables import take_rows
 from rigwake._types import Array, Indices
+from rigwake.monitor.block_motion import (
+    BIAS_START_STD,
+    FEWEST_ROWS,
+    BlockMotion,
+    GyroBias,
+    above_water,
+    block_motion,
+    way_residuals,
+)
 from rigwake.monitor.frame_pairs import EpipolarPairs, pair_frames
-from rigwake.monitor.pair_kernels import COLUMNS, MOUNTING, accumulate, pair_residuals, sum_by
+from rigwake.monitor.pair_kernels import COLUMNS, LOSS_STDS, MOUNTING, accumulate, sum_by
 from rigwake.monitor.rig_motion import PairMotion, RigMotion
-from rigwake.monitor.velocity import Slots, VelocityPriors, slots_of, solve_velocities, without_slow
+from rigwake.monitor.velocity import Slots, VelocityPriors
 from rigwake.rig import Rig
 from rigwake.tracks import Tracks
 
 BLOCK_S = 10.0
 _SCORE_LOSS_STDS = 4.0  # of Cauchy's: a camera that moved must not be taken for outliers
-_LEAST_WAY_M = 0.25
-_FEWEST_ROWS = 60  # observations of a camera in a block
-_BELOW_HORIZON = float(np.sin(np.deg2rad(-1.0)))  # what is lower is taken for water
-_LARGEST_NOISE = 30.0
-_BIAS_START_STD, _BIAS_AGAIN_STD, _BIAS_LEAST_STD = 5e-3, 1e-3, 1e-4  # rad/s
+_BIAS_LEAST_STD, _BIAS_ROUNDS = 1e-4, 12  # rad/s
+_BIAS_TRIALS = np.linspace(-2.0, 2.0, 7)  # standard deviations: a fifth of a degree per second apart
 _NUISANCES = 6  # of a slot: rotation and velocity of the rig
 _SECTORS = 4  # of the image, around the optical axis
-
-
-@dataclass(frozen=True, eq=False)
-class GyroBias:
-    """What is known of the gyro's bias beside what was taken off before: rad/s, and its standard deviation."""
-
-    value: Array
-    std: float
-
-    @classmethod
-    def unknown(cls) -> GyroBias:
-        """Before anything was seen."""
-        return cls(np.zeros(3), _BIAS_START_STD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +50,8 @@ class BlockScores:
     varies more than `H` says, from the scatter of whole tracks. noise: (B, C), residuals over what the tracks predict.
     rows: (B, C) observations used. speed: (B,) m/s, turning: (B,) root mean square of the turn rate, rad/s.
     gravity: (B, 3) mean direction against gravity in rig axes. sectors: (B, C, 4, 4, 4) of image quarters the normal
-    equations of a rotation alone: `[[H, g], [g, n]]`. bias: (B, 3) rad/s.
+    equations of a rotation alone: `[[H, g], [g, n]]`. bias: (B, 3) rad/s,
+    of the gyro beside what was taken off before, and bias_std (B,).
     """
 
     cameras: tuple[str, ...]
@@ -73,6 +66,7 @@ class BlockScores:
     gravity: Array
     sectors: Array
     bias: Array
+    bias_std: Array
 
     def __len__(self) -> int:
         return len(self.starts_ns)
@@ -81,6 +75,13 @@ class BlockScores:
         """Where a camera's rotation (part 0), translation (1) or time offset (2) stands."""
         first = MOUNTING * camera + 3 * part
         return slice(first, first + (1 if part == 2 else 3))
+
+    def by_column(self, values: Array) -> Array:
+        """Numbers of the cameras (.., C) for every column of `H`; offsets of pairs take the cameras' mean."""
+        own = np.repeat(values, MOUNTING, axis=-1)
+        more = self.H.shape[-1] - own.shape[-1]
+        mean = np.broadcast_to(values.mean(axis=-1, keepdims=True), (*values.shape[:-1], more))
+        return np.concatenate([own, mean], axis=-1)
 
     def take(self, index: slice | NDArray[np.int64]) -> BlockScores:
         """The chosen blocks."""
@@ -101,6 +102,7 @@ def join_blocks(parts: list[BlockScores]) -> BlockScores:
         "gravity",
         "sectors",
         "bias",
+        "bias_std",
     )
     return BlockScores(
         parts[0].cameras, *(np.concatenate([getattr(part, name) for part in parts]) for name in names)
@@ -121,20 +123,69 @@ def score_blocks(
     tracks: of every camera of the rig. rig: in the IMU's frame (`rig_motion.py`), every number known. starts_ns: of the
     blocks; from the first to the last frame by default. bias: of the gyro, where it is known from before.
     """
+    return score_blocks_with_motion(tracks, rig, motion, starts_ns=starts_ns, bias=bias, stride=stride)[0]
+
+
+def score_blocks_with_motion(
+    tracks: Mapping[str, Tracks],
+    rig: Rig,
+    motion: RigMotion,
+    *,
+    starts_ns: Indices | None = None,
+    bias: GyroBias | None = None,
+    stride: int = 1,
+) -> tuple[BlockScores, list[BlockMotion | None]]:
+    """As `score_blocks`, and how the rig moved in every block, None where it made too little way."""
     if starts_ns is None:
         starts_ns = block_starts(tracks, rig, motion)
     bias = bias or GyroBias.unknown()
-    blocks = []
+    blocks, motions = [], []
     for start in starts_ns.tolist():
-        pairs = pair_frames(tracks, rig, start, start + round(BLOCK_S * 1e9), stride=stride)
-        block, found = score_block(pairs, rig, motion, start, bias)
-        if bias.std >= _BIAS_START_STD and found.std < bias.std:  # once more: it was linearised far off
-            block, found = score_block(pairs, rig, motion, start, GyroBias(found.value, _BIAS_AGAIN_STD))
+        pairs = above_water(
+            pair_frames(tracks, rig, start, start + round(BLOCK_S * 1e9), stride=stride), motion
+        )
+        if bias.std >= BIAS_START_STD:
+            bias = _likeliest_bias(pairs, rig, motion, start, bias)
+        for _ in range(_BIAS_ROUNDS):
+            moved = block_motion(pairs, rig, motion, bias)
+            block, found = score_block(moved, rig, motion, start, bias)
+            if np.linalg.norm(found.value - bias.value) <= found.std:
+                break
+            # velocities were found with a bias that is far off: over an open bay they make up for it, so that one
+            # step does not reach the optimum, however sure it looks
+            bias = GyroBias(found.value, BIAS_START_STD)
         bias = found
         blocks.append(block)
+        motions.append(moved)
     if not blocks:
-        return _nothing(tuple(rig.cameras), np.empty(0, dtype=np.int64))
-    return join_blocks(blocks)
+        return _nothing(tuple(rig.cameras), np.empty(0, dtype=np.int64)), []
+    return join_blocks(blocks), motions
+
+
+def _likeliest_bias(
+    pairs: EpipolarPairs, rig: Rig, motion: RigMotion, start_ns: int, bias: GyroBias
+) -> GyroBias:
+    """The start for the gyro's bias about the vertical, of some within two standard deviations, that leads to the best
+    fit after one step.
+
+    Over an open bay a wrong bias and a wrong direction of travel together fit nearly as well as the true ones, and no
+    step leads from one to the other. Gravity tells the bias about the level axes (`rig_motion.py`).
+    """
+    if len(pairs.pair) < FEWEST_ROWS:
+        return bias
+    up = motion.up_rig_at(pairs.first_ns[:1])[0]
+    best, least = bias, np.inf
+    for stds in _BIAS_TRIALS:
+        tried = GyroBias(bias.value + stds * bias.std * up, bias.std)
+        found = score_block(block_motion(pairs, rig, motion, tried), rig, motion, start_ns, tried)[1]
+        moved = block_motion(pairs, rig, motion, found)
+        if moved is None:
+            continue
+        residual = way_residuals(moved.pairs, moved.between.rotation, moved.way) / LOSS_STDS
+        cost = LOSS_STDS**2 * len(pairs.pair) * float(np.log1p(residual**2).mean()) + stds**2
+        if cost < least:
+            best, least = GyroBias(found.value, bias.std), cost
+    return best
 
 
 def block_starts(tracks: Mapping[str, Tracks], rig: Rig, motion: RigMotion) -> Indices:
@@ -155,28 +206,15 @@ def block_starts(tracks: Mapping[str, Tracks], rig: Rig, motion: RigMotion) -> I
 
 
 def score_block(
-    pairs: EpipolarPairs, rig: Rig, motion: RigMotion, start_ns: int, bias: GyroBias
+    moved: BlockMotion | None, rig: Rig, motion: RigMotion, start_ns: int, bias: GyroBias
 ) -> tuple[BlockScores, GyroBias]:
     """One block, and what is known of the gyro's bias after it."""
-    pairs = _above_water(pairs, motion)
-    size = MOUNTING * len(pairs.cameras)
-    empty = _nothing(pairs.cameras, np.array([start_ns], dtype=np.int64))
-    if len(pairs.pair) < _FEWEST_ROWS:
-        return empty, bias
-    place = np.stack([rig.camera(name).rig_from_cam.translation for name in pairs.cameras])[pairs.camera]
-    slots = slots_of(pairs, motion, _spacing(pairs))
-    between = motion.between(pairs.first_ns, pairs.second_ns, slots.reference_ns[slots.slot], bias.value)
-    spans = motion.between(slots.first_ns, slots.second_ns, slots.reference_ns, bias.value)
-    scale = np.ones(len(pairs.cameras))
-    priors = VelocityPriors.of(slots, spans, motion, bias.value)
-    velocity, way = solve_velocities(pairs, between, priors, place, scale[pairs.camera])
-    pairs = without_slow(pairs, way, _LEAST_WAY_M)
-    if len(pairs.pair) < _FEWEST_ROWS:
-        return empty, bias
-    for _ in range(2):
-        scale = _noise(_residuals(pairs, between.rotation, way), pairs)
-        velocity, way = solve_velocities(pairs, between, priors, place, scale[pairs.camera], velocity, 3)
-    residual = _residuals(pairs, between.rotation, way)
+    size = MOUNTING * len(rig.cameras)
+    if moved is None:
+        return _nothing(tuple(rig.cameras), np.array([start_ns], dtype=np.int64)), bias
+    pairs, between, way, scale = moved.pairs, moved.between, moved.way, moved.scale
+    slots = moved.priors.slots
+    residual = way_residuals(pairs, between.rotation, way)
     whitened = residual / (_SCORE_LOSS_STDS * scale[pairs.camera][pairs.pair])
     weight = 1 / (1 + whitened**2) / scale[pairs.camera][pairs.pair] ** 2
     products = np.zeros((len(pairs.camera), COLUMNS, COLUMNS))
@@ -190,7 +228,7 @@ def score_block(
         between.rotation,
         way,
         between.by_velocity,
-        place,
+        moved.place,
         between.turning,
         between.drift,
         between.turning_first,
@@ -198,9 +236,9 @@ def score_block(
         rows,
     )
     products = products + np.tril(products, -1).transpose(0, 2, 1)
-    H, g, new_bias = _eliminate(products, pairs, priors, velocity, motion.gyro_noise, bias)
+    H, g, new_bias = _eliminate(products, pairs, moved.priors, moved.velocity, motion.gyro_noise, bias)
     counts = np.bincount(pairs.camera[pairs.pair], minlength=len(pairs.cameras))
-    poor = np.repeat(counts < _FEWEST_ROWS, MOUNTING)
+    poor = np.repeat(counts < FEWEST_ROWS, MOUNTING)
     H[poor, :], H[:, poor], g[poor] = 0.0, 0.0, 0.0
     up = motion.up_rig_at(slots.reference_ns).mean(axis=0)
     rates = np.linalg.norm(between.turning_first, axis=1)
@@ -212,60 +250,18 @@ def score_block(
         _inflation(rows, weight, pairs)[None],
         scale[None],
         counts[None],
-        np.array([float(np.median(np.linalg.norm(velocity, axis=1)))]),
+        np.array([float(np.median(np.linalg.norm(moved.velocity, axis=1)))]),
         np.array([float(np.sqrt(np.mean(rates**2)))]),
         up[None] / np.linalg.norm(up),
         _sectors(rows, weight, pairs)[None],
         new_bias.value[None],
+        np.array([new_bias.std]),
     )
     return block, new_bias
 
 
-def _above_water(pairs: EpipolarPairs, motion: RigMotion) -> EpipolarPairs:
-    """Without what lies below the horizon: water moves by itself."""
-    if not len(pairs.pair):
-        return pairs
-    up = motion.up_rig_at(pairs.first_ns)[pairs.pair]
-    kept = np.einsum("ni,ni->n", pairs.first, up) > _BELOW_HORIZON
-    return EpipolarPairs(
-        pairs.cameras,
-        pairs.camera,
-        pairs.first_ns,
-        pairs.second_ns,
-        pairs.first[kept],
-        pairs.second[kept],
-        pairs.std[kept],
-        pairs.pair[kept],
-        pairs.cluster[kept],
-        pairs.pixels[kept],
-    )
-
-
-def _spacing(pairs: EpipolarPairs) -> int:
-    """Nanoseconds between the starts of a camera's pairs."""
-    steps = np.diff(pairs.first_ns)[np.diff(pairs.camera) == 0]
-    return int(np.median(steps)) if len(steps) else round(1e9)
-
-
 def _pair_seconds(slots: Slots) -> float:
     return float(np.median(slots.second_ns - slots.first_ns)) * 1e-9
-
-
-def _residuals(pairs: EpipolarPairs, rotation: Array, way: Array) -> Array:
-    residual = np.empty(len(pairs.pair))
-    pair_residuals(pairs.first, pairs.second, pairs.std, pairs.pair, rotation, way, residual)
-    return residual
-
-
-def _noise(residual: Array, pairs: EpipolarPairs) -> Array:
-    """(C,) how much larger a camera's residuals are than predicted, at least half."""
-    camera = pairs.camera[pairs.pair]
-    scale = np.ones(len(pairs.cameras))
-    for k in range(len(scale)):
-        of_camera = np.abs(residual[camera == k])
-        if len(of_camera):
-            scale[k] = np.clip(MAD_TO_STD * float(np.median(of_camera)), 0.5, _LARGEST_NOISE)
-    return scale
 
 
 def _eliminate(
@@ -394,4 +390,5 @@ def _nothing(cameras: tuple[str, ...], starts_ns: Indices) -> BlockScores:
         np.zeros((b, 3)),
         np.zeros((b, c, _SECTORS, 4, 4)),
         np.full((b, 3), np.nan),
+        np.full(b, np.nan),
     )

@@ -18,7 +18,9 @@ class Thresholds:
     margin: by how much (log likelihood) the blamed explanation must beat all others. observable_deg: an axis with a
     larger standard deviation over the longest window is not observable. shortest, longest: blocks of a window;
     steady_lag: blocks that what was steady before is away from it.
-    floor_deg: systematic error that no amount of data takes away.
+    floor_deg: systematic error that no amount of data takes away. offset_deg: by how much lenses let two cameras
+    disagree where their pictures overlap; offset_floor_deg: how much of that may change over minutes. support: log
+    likelihood that the motion alone must add to what all cues together say of a camera.
     calm_blocks: quiet blocks that end a suspicion. patience: blocks that blame may take.
     """
 
@@ -32,6 +34,9 @@ class Thresholds:
     margin: float = 3.0
     observable_deg: float = 0.15
     floor_deg: float = 0.005
+    offset_deg: float = 0.03
+    offset_floor_deg: float = 0.01
+    support: float = 2.0
     calm_blocks: int = 3
     patience: int = 3
 

@@ -51,13 +51,16 @@ class MonitoredRig:
         return {name: camera.rig_from_cam.translation for name, camera in self.rig.cameras.items()}
 
 
-def prepare_rig(calibration: Calibration, recording: Recording) -> MonitoredRig:
+def prepare_rig(calibration: Calibration, recording: Recording, *, is_its_own: bool = False) -> MonitoredRig:
     """Check that the recording is of the calibrated vessel and has what monitoring needs.
+
+    is_its_own: the calibration is of this very recording: lenses may have been refined, and no vessel is mixed up.
 
     Raises InputError (another vessel, no IMU, a frame that cannot be tied to the IMU), UnobservableError with one
     camera only.
     """
-    require_same_vessel(fingerprint_of_calibration(calibration), fingerprint_of_recording(recording))
+    if not is_its_own:
+        require_same_vessel(fingerprint_of_calibration(calibration), fingerprint_of_recording(recording))
     imu, gnss = main_imu(recording), main_gnss(recording)
     if imu is None:
         raise InputError(

@@ -16,6 +16,7 @@ from rigwake.calibration import Calibration, save_calibration
 from rigwake.config import CalibrateConfig
 from rigwake.errors import InputError, UnobservableError
 from rigwake.fingerprint import files_changed_at, input_fingerprint, unchanged
+from rigwake.monitor.knocks import knocks_inside
 from rigwake.pipeline.before_start import (
     check_fields_of_view,
     check_line_delays,
@@ -218,6 +219,7 @@ def _conclude(
     }
     notes = (*selection.notes, *(f"{o.name}: {n}" for o in outcomes for n in o.notes), *first.notes)
     notes += _noisy_imu(rig.calibration) + _moved_intrinsics(rig.calibration)
+    notes += _knocks(prepared.opened, rig.calibration, selection, out)
     calibration = replace(
         rig.calibration,
         checks={
@@ -233,6 +235,25 @@ def _conclude(
     progress("rig", "writing the report", 0.95)
     build_report(load_report_content(out))
     return CalibrationRun(calibration, out, failed, notes, checks)
+
+
+def _knocks(
+    recording: Recording, calibration: Calibration, selection: Selection, out: Path
+) -> tuple[str, ...]:
+    """What the monitor's statistic says of cameras that turned during the recording; nothing without IMU or tracks."""
+    files = {name: tracks_file(out, name) for name in calibration.cameras}
+    if selection.imu is None or len(files) < 2 or not all(file.is_file() for file in files.values()):
+        return ()
+    opened = replace(
+        recording,
+        cameras={**recording.cameras, **selection.cameras},
+        imus={selection.imu.name: selection.imu},
+        gnss={} if selection.gnss is None else {selection.gnss.name: selection.gnss},
+    )
+    try:
+        return knocks_inside(calibration, opened, {name: load_tracks(file) for name, file in files.items()})
+    except (InputError, UnobservableError) as error:
+        return (f"Whether a camera moved during the recording was not checked: {error.cause}",)
 
 
 def _each_camera(

@@ -17,11 +17,11 @@ from rigwake.ba.rig.rig_values import AdjustedRig, InitialRig
 from rigwake.ba.rig.search_proposals import camera_from_world
 from rigwake.ba.solver.rig_problem import RigProblem
 from rigwake.calibration import Calibration, save_calibration
-from rigwake.cameras.protocol import CameraModel
 from rigwake.pipeline.adjustment_record import write_adjustment
 from rigwake.pipeline.association_patches import write_patches
 from rigwake.pipeline.stream_selection import Selection
 from rigwake.recording import CameraStream
+from rigwake.report.picture_overlays import horizon_pixels
 from rigwake.trajectory import Trajectory
 from rigwake.writers.trajectory_writer import write_tum
 
@@ -166,19 +166,6 @@ def horizon_of_image(problem: RigProblem, camera: int, timestamp_ns: int) -> Arr
     """(N, 2) pixels of the horizon in a camera's image of this stamp, on its own clock; NaN outside the image."""
     cam_from_world = camera_from_world(problem, camera, np.array([timestamp_ns]))[0]
     return horizon_pixels(problem.cameras[camera].model, cam_from_world.rotation[:, 2])
-
-
-def horizon_pixels(model: CameraModel, up_cam: Array) -> Array:
-    """(N, 2) pixels of directions at right angles to `up_cam` (3,), in order round the horizon; NaN where the lens
-    does not see it."""
-    side = np.cross(up_cam, np.eye(3)[np.argmin(np.abs(up_cam))])
-    side /= np.linalg.norm(side)
-    ahead = np.cross(up_cam, side)
-    angle = np.linspace(0, 2 * np.pi, 361)[:, None]
-    pixels, valid = model.project(np.cos(angle) * ahead + np.sin(angle) * side)
-    inside = valid & (pixels > -0.5).all(axis=1)
-    inside &= (pixels < np.array([model.width_px, model.height_px]) - 0.5).all(axis=1)
-    return np.asarray(np.where(inside[:, None], pixels, np.nan))
 
 
 def _without_nan(value: Any) -> Any:

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from rigwake._types import Array
+from rigwake.cameras.protocol import CameraModel
 from rigwake.readers.picture_files import picture_or_none
 from rigwake.report.content import OverlayPoint, Picture
 
@@ -109,3 +111,16 @@ def _median(points: Sequence[OverlayPoint]) -> float:
         np.hypot(p.predicted_px[0] - p.observed_px[0], p.predicted_px[1] - p.observed_px[1]) for p in points
     ]
     return float(np.median(errors)) if errors else float("nan")
+
+
+def horizon_pixels(model: CameraModel, up_cam: Array) -> Array:
+    """(N, 2) pixels of directions at right angles to `up_cam` (3,), in order round the horizon; NaN where the lens
+    does not see it."""
+    side = np.cross(up_cam, np.eye(3)[np.argmin(np.abs(up_cam))])
+    side /= np.linalg.norm(side)
+    ahead = np.cross(up_cam, side)
+    angle = np.linspace(0, 2 * np.pi, 361)[:, None]
+    pixels, valid = model.project(np.cos(angle) * ahead + np.sin(angle) * side)
+    inside = valid & (pixels > -0.5).all(axis=1)
+    inside &= (pixels < np.array([model.width_px, model.height_px]) - 0.5).all(axis=1)
+    return np.asarray(np.where(inside[:, None], pixels, np.nan))

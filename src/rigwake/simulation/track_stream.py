@@ -16,11 +16,12 @@ from rigwake._types import Array
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.rig import Rig, RigCamera
+from rigwake.simulation.cross_sightings import simulate_cross_views
 from rigwake.simulation.scenario import Camera
 from rigwake.simulation.scene_layout import sample_landmarks
 from rigwake.simulation.setup import Simulation
-from rigwake.simulation.tracks_only import _land_and_water, _observe, _sort
-from rigwake.tracks import Tracks
+from rigwake.simulation.tracks_only import CameraTruth, _land_and_water, _observe, _sort
+from rigwake.tracks import CrossViews, Tracks
 
 PixelFault = Callable[[Array, Array], Array]
 """Pixels (N, 2) as a faulty lens shows them, from the true ones and the times (N,) in seconds."""
@@ -85,18 +86,37 @@ def stream_tracks(
 
     What reaches over is drawn anew in the next stretch; the same tracks never appear in two stretches.
     """
+    for first, tracks, _ in stream_sightings(
+        simulation, stretch_s, overlap_s=overlap_s, fault=fault, until_s=until_s, cross_views=0
+    ):
+        yield first, tracks
+
+
+def stream_sightings(
+    simulation: Simulation,
+    stretch_s: float,
+    *,
+    overlap_s: float = 1.3,
+    fault: MountFault | None = None,
+    until_s: float | None = None,
+    cross_views: int = 30,
+) -> Iterator[tuple[float, Mapping[str, Tracks], CrossViews]]:
+    """As `stream_tracks`, and what a search for tracked landmarks in the other cameras' pictures would find.
+
+    cross_views: per second, pair of cameras and time (the same, or up to a second apart), at most.
+    """
     scenario = simulation.scenario
     landmarks = sample_landmarks(simulation.layout, simulation.rng(10), scenario.tracking.landmarks)
     end = until_s if until_s is not None else scenario.duration_s
     for number, first in enumerate(np.arange(0.0, end, stretch_s).tolist()):
         last = min(first + stretch_s + overlap_s, end)
-        yield (
-            first,
-            {
-                camera.name: _tracks(simulation, index, camera, landmarks, fault, first, last, number)
-                for index, camera in enumerate(scenario.cameras)
-            },
-        )
+        stretches, tracks, truths = {}, {}, {}
+        for index, camera in enumerate(scenario.cameras):
+            stretch, seen, truth = _tracks(simulation, index, camera, landmarks, fault, first, last, number)
+            stretches[camera.name], tracks[camera.name], truths[camera.name] = stretch, seen, truth
+        rng = simulation.rng(14, number)
+        views = simulate_cross_views(stretches, tracks, truths, landmarks, cross_views, rng)
+        yield first, tracks, views
 
 
 def tracks_within(
@@ -112,7 +132,7 @@ def tracks_within(
     return {
         camera.name: _joined(
             [
-                _tracks(simulation, index, camera, landmarks, None, first, last, round(first * 1e3))
+                _tracks(simulation, index, camera, landmarks, None, first, last, round(first * 1e3))[1]
                 for first, last in spans_s
             ]
         )
@@ -144,7 +164,7 @@ def _tracks(
     first_s: float,
     last_s: float,
     number: int,
-) -> Tracks:
+) -> tuple[Simulation, Tracks, CameraTruth]:
     given = {part.name: getattr(simulation, part.name) for part in fields(Simulation)}
     stretch = _Stretch(**given, first_s=first_s, last_s=last_s, fault=fault)
     mine = fault if fault is not None and fault.camera == camera.name else None
@@ -160,4 +180,4 @@ def _tracks(
         times = stretch.scene_times_s(camera)[exact.frame]
         pixels = np.where((times >= mine.at_s)[:, None], mine.pixels(exact.pixels, times), exact.pixels)
         exact = type(exact)(exact.frame, exact.track, exact.landmark, pixels)
-    return _observe(stretch, camera, exact, simulation.scenario.tracking, rng)[0]
+    return stretch, *_observe(stretch, camera, exact, simulation.scenario.tracking, rng)

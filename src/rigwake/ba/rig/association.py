@@ -8,14 +8,14 @@ what fixes vertical offsets on calm water.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
 
 import numpy as np
 
 from rigwake._types import Array, Indices
 from rigwake.ba.rig.search_proposals import AssociationOptions, Searches
-from rigwake.ba.solver.rig_problem import Observations, RigProblem
+from rigwake.ba.solver.rig_problem import Observations
 from rigwake.parallel import over_ranges
 from rigwake.recording import CameraStream
 from rigwake.tracking.interpolation import Coefficients, spline_coefficients
@@ -26,14 +26,19 @@ _REACH_PX = 2.5  # what one registration can bridge
 
 
 def find_landmarks(
-    problem: RigProblem, searches: Searches, streams: Mapping[str, CameraStream], options: AssociationOptions
+    names: Sequence[str],
+    searches: Searches,
+    streams: Mapping[str, CameraStream],
+    options: AssociationOptions,
 ) -> Observations:
     """Carry out the searches; what agrees, as observations of the landmarks searched for.
+
+    names: of the cameras that the searches count.
 
     Two passes over the images, one at a time: patches are cut out of the sources, then looked for.
     """
     shape = PatchShape.disc(options.patch_radius_px)
-    references, cut = _cut_patches(problem, searches, streams, shape)
+    references, cut = _cut_patches(names, searches, streams, shape)
     searches = searches.take(cut)
     pixels = np.full((len(searches), 2), np.nan)
     std_px = np.full(len(searches), np.nan)
@@ -47,7 +52,7 @@ def find_landmarks(
             pixels[wanted], std_px[wanted] = _look_around(coefficients, patches, shape, own, options)
             pixels[wanted] -= registration_bias(patches, own.warps, own.second_order)
 
-    _each_camera(problem, streams, look)
+    _each_camera(names, streams, look)
     agreed = np.flatnonzero(np.isfinite(std_px))
     return Observations(
         searches.cameras[agreed],
@@ -59,7 +64,7 @@ def find_landmarks(
 
 
 def _cut_patches(
-    problem: RigProblem, searches: Searches, streams: Mapping[str, CameraStream], shape: PatchShape
+    names: Sequence[str], searches: Searches, streams: Mapping[str, CameraStream], shape: PatchShape
 ) -> tuple[References, Indices]:
     """Reference patches of the searches' sources, and which searches have one, in that order."""
     by_camera: dict[int, list[tuple[References, Indices]]] = {}
@@ -72,7 +77,7 @@ def _cut_patches(
             made, good = make_references(coefficients, searches.source_pixels[at], shape)
             own.append((made.take(good), at[good]))
 
-    _each_camera(problem, streams, cut_out)
+    _each_camera(names, streams, cut_out)
     pieces = [piece for camera in sorted(by_camera) for piece in by_camera[camera]]
     parts, cut = [part for part, _ in pieces], [rows for _, rows in pieces]
     if not parts:
@@ -84,15 +89,15 @@ def _cut_patches(
 
 
 def _each_camera(
-    problem: RigProblem, streams: Mapping[str, CameraStream], work: Callable[[int, CameraStream], None]
+    names: Sequence[str], streams: Mapping[str, CameraStream], work: Callable[[int, CameraStream], None]
 ) -> None:
     """Cameras side by side: decoding and registration leave the interpreter to the other threads."""
 
     def one(first: int, last: int) -> None:
         for camera in range(first, last):
-            work(camera, streams[problem.cameras[camera].name])
+            work(camera, streams[names[camera]])
 
-    over_ranges(np.arange(len(problem.cameras) + 1), one)
+    over_ranges(np.arange(len(names) + 1), one)
 
 
 def _images(stream: CameraStream, stamps: Indices) -> Iterator[tuple[Coefficients, Indices]]:

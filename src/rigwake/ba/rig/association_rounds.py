@@ -71,7 +71,7 @@ def adjust_with_association(
         images = _images(problem.observations, [c.name for c in problem.cameras])
         progress(f"looking for landmarks in other cameras, round {done + 1}")
         searches = propose_searches(problem, images, usable, search)
-        found = find_landmarks(problem, searches, streams, search)
+        found = find_landmarks([camera.name for camera in problem.cameras], searches, streams, search)
         is_held_out = held_out_landmarks(adjusted)[found.landmark_indices]
         found, held_out = found.take(~is_held_out), found.take(is_held_out)
         found = _weighed(found, adjusted.solution)

@@ -14,6 +14,7 @@ import numpy as np
 from rigwake._tables import take_rows
 from rigwake._types import Array, Indices, Mask
 from rigwake.ba.solver.rig_problem import Observations, RigProblem
+from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import UsageError
 from rigwake.geometry.interpolate import interpolate
 from rigwake.geometry.se3 import SE3
@@ -303,35 +304,58 @@ def with_warps(problem: RigProblem, searches: Searches, options: AssociationOpti
             rows = np.flatnonzero((searches.source_cameras == source) & (searches.cameras == target))
             if len(rows):
                 mapped[rows] = _mapped(problem, searches.take(rows), source, target)
+    return warped(searches, mapped, options)
+
+
+def warped(searches: Searches, mapped: Array, options: AssociationOptions) -> Searches:
+    """The searches with the warps of their mapped stencils (S, 9, 2), without those that are not seen alike."""
     grid = mapped.reshape(-1, 3, 3, 2)
     left, right, above, below = grid[:, 1, 0], grid[:, 1, 2], grid[:, 0, 1], grid[:, 2, 1]
     twice_centre = 2 * grid[:, 1, 1]
     warps = np.stack([right - left, below - above], axis=2) / (2 * _STENCIL_PX)
     twisted = (grid[:, 2, 2] + grid[:, 0, 0] - grid[:, 2, 0] - grid[:, 0, 2]) / 4
     curved = np.stack([right + left - twice_centre, twisted, below + above - twice_centre], axis=2)
-    good = np.isfinite(mapped).all(axis=(1, 2))
+    good: Mask = np.asarray(np.isfinite(mapped).all(axis=(1, 2)))
     stretch = np.sqrt(np.abs(np.linalg.det(np.where(good[:, None, None], warps, np.eye(2)))))
     good &= (stretch < options.max_stretch) & (stretch > 1 / options.max_stretch)
     return replace(searches, warps=warps, second_order=curved / _STENCIL_PX**2).take(np.flatnonzero(good))
 
 
 def _mapped(problem: RigProblem, searches: Searches, source: int, target: int) -> Array:
-    """(S, 9, 2) where the 3 x 3 stencils about the source pixels come to lie in the target's images; NaN outside."""
-    points = problem.landmarks.points_world[searches.landmarks]
-    world_from_source = camera_from_world(problem, source, searches.source_stamps).inverse()
-    target_from_world = camera_from_world(problem, target, searches.stamps)
-    stencil = (searches.source_pixels[:, None] + _STENCIL).reshape(-1, 2)
-    bearings, _ = problem.cameras[source].model.unproject(stencil)
+    """Stencils of searches of one camera in another, mapped."""
+    return map_stencils(
+        searches.source_pixels,
+        problem.landmarks.points_world[searches.landmarks],
+        (problem.cameras[source].model, problem.cameras[target].model),
+        camera_from_world(problem, source, searches.source_stamps).inverse(),
+        camera_from_world(problem, target, searches.stamps),
+    )
+
+
+def map_stencils(
+    source_pixels: Array,
+    points_world: Array,
+    models: tuple[CameraModel, CameraModel],
+    world_from_source: SE3,
+    target_from_world: SE3,
+) -> Array:
+    """(S, 9, 2) where the 3 x 3 stencils about the source pixels come to lie in the target's images; NaN outside.
+
+    source_pixels: (S, 2). points_world: (S, 3), through which planes go that face halfway between both viewers.
+    models: of the source and of the target.
+    """
+    stencil = (source_pixels[:, None] + _STENCIL).reshape(-1, 2)
+    bearings, _ = models[0].unproject(stencil)
     rays = np.einsum("nij,nkj->nki", world_from_source.rotation, bearings.reshape(-1, 9, 3))
-    to_source = _unit(world_from_source.translation - points)
-    to_target = _unit(target_from_world.inverse().translation - points)
+    to_source = _unit(world_from_source.translation - points_world)
+    to_target = _unit(target_from_world.inverse().translation - points_world)
     normal = _unit(to_source + to_target)
-    depth = np.einsum("ni,ni->n", normal, points - world_from_source.translation)
+    depth = np.einsum("ni,ni->n", normal, points_world - world_from_source.translation)
     slope = np.einsum("ni,nki->nk", normal, rays)
     corners = world_from_source.translation[:, None] + rays * (depth[:, None] / slope)[:, :, None]
     corners_cam = np.einsum("nij,nkj->nki", target_from_world.rotation, corners)
     corners_cam += target_from_world.translation[:, None]
-    pixels, _ = problem.cameras[target].model.project(corners_cam.reshape(-1, 3))
+    pixels, _ = models[1].project(corners_cam.reshape(-1, 3))
     return pixels.reshape(-1, 9, 2)
 
 
