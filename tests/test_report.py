@@ -101,6 +101,22 @@ def test_landmarks_that_lie_wrong_are_marked(page: str) -> None:
     assert "6.00 px off <b>bad</b>" in page
 
 
+@pytest.mark.parametrize("halves", [3, [None], [{"translation_m": [1, "x"]}], [{"std_rotation_deg": None}]])
+def test_halves_of_any_shape_cost_no_report(tmp_path: Path, halves: object) -> None:
+    checks = {"split_half": {"port": {"sigmas": 1.0, "halves": halves}}}
+    save_calibration(replace(boat(), checks=checks), tmp_path / "calibration.yaml")
+    assert "Two halves of the recording" in build_report(tmp_path).read_text()
+
+
+def test_series_with_holes_are_not_drawn(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    with np.load(copy / "adjustment.npz") as arrays:
+        changed = dict(arrays)
+    changed["gnss_off"][3] = np.nan
+    np.savez(copy / "adjustment.npz", **changed)
+    assert "not all values of gnss_off are finite" in load_report_content(copy).absent["adjustment"]
+
+
 def test_a_huge_adjustment_file_is_not_loaded(folder: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
     np.savez_compressed(copy / "adjustment.npz", gyro_bias=np.zeros((3_000_000, 3)))

@@ -61,6 +61,8 @@ def _chosen(problem: RigProblem, unused: Observations) -> Indices:
     """Rows: by ordered pair of cameras the worst and the middle one, of different cameras first."""
     off = np.linalg.norm(predicted_pixels(problem, unused) - unused.pixels, axis=1)
     first = first_cameras(problem)[unused.landmark_indices]
+    counts = np.bincount(problem.observations.landmark_indices, minlength=len(problem.landmarks))
+    off[counts[unused.landmark_indices] == 0] = np.nan  # nothing is left that could be shown as seen
     cameras = len(problem.cameras)
     apart: list[int] = []
     same: list[int] = []

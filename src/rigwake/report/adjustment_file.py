@@ -91,6 +91,8 @@ def _series(
     shapes = {arrays[name].shape, *(() if std is None else (std.shape,))}
     if shapes != {(len(stamps), 3)}:
         raise InputError(f"adjustment.npz: the arrays of {name} disagree in length: {sorted(shapes)}.")
+    if not np.isfinite(arrays[name]).all() or (std is not None and not (np.isfinite(std) & (std > 0)).all()):
+        raise InputError(f"adjustment.npz: not all values of {name} are finite.")
     count = int(arrays.get(f"{sensor}_count", np.array(len(stamps))))
     return SensorSeries((stamps - start_ns) * 1e-9, arrays[name].astype(np.float64), std, count)
 

@@ -51,8 +51,9 @@ def embed_pictures(pictures: Sequence[Picture]) -> tuple[list[EmbeddedPicture], 
             unreadable.append(picture.file.name)
             continue
         height_px, width_px = image.shape[:2]
+        points = tuple(p for p in picture.points if np.isfinite([*p.predicted_px, *p.observed_px]).all())
         if picture.kind == "patches":
-            if picture.tile_px <= 0 or len(picture.points) != 1:
+            if not picture.tile_px > 0 or len(points) != 1:
                 unreadable.append(picture.file.name)
                 continue
             width = min(width_px, _PATCH_WIDTH_PX)
@@ -64,7 +65,7 @@ def embed_pictures(pictures: Sequence[Picture]) -> tuple[list[EmbeddedPicture], 
                 width_px,
                 height_px,
                 _pieces(picture.horizon_px),
-                tuple(p for p in picture.points if np.isfinite([*p.predicted_px, *p.observed_px]).all()),
+                points,
                 _median(picture.points),
             )
         )

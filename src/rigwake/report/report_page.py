@@ -181,22 +181,25 @@ def _halves(checks: Mapping[str, Any]) -> dict[str, list[list[tuple[str, str]]]]
     split = plain(checks.get("split_half"))
     for name, one in split.items() if isinstance(split, Mapping) else ():
         halves = one.get("halves") if isinstance(one, Mapping) else None
-        if not isinstance(halves, list):
-            continue
-        for half in halves:
+        for half in halves if isinstance(halves, list) else ():
+            told = half if isinstance(half, Mapping) else {}
+            positions, stds, turns = (_three(told.get(key)) for key in _HALF)
             cells = [
-                (number(_metres(x), 1), plus_minus(_metres(s), "mm"))
-                for x, s in zip(half["translation_m"], half["std_translation_m"], strict=True)
+                (number(1e3 * x, 1), plus_minus(1e3 * s, "mm")) for x, s in zip(positions, stds, strict=True)
             ]
-            turn = [s for s in half["std_rotation_deg"] if isinstance(s, int | float)]
-            cells.append(("", plus_minus(max(turn), "°") if turn else "unobservable"))
+            known = turns[np.isfinite(turns)]
+            cells.append(("", plus_minus(known.max(), "°") if len(known) else "unobservable"))
             found.setdefault(str(name), []).append(cells)
     return found
 
 
-def _metres(value: Any) -> float:
-    """Millimetres of a number of metres; NaN where there is none."""
-    return 1e3 * float(value) if isinstance(value, int | float) else float("nan")
+_HALF = ("translation_m", "std_translation_m", "std_rotation_deg")
+
+
+def _three(values: Any) -> Array:
+    """Three figures of a file that may hold anything; NaN where there is none."""
+    given = values if isinstance(values, list) and len(values) == 3 else [None] * 3
+    return np.array([float(x) if isinstance(x, int | float) else np.nan for x in given])
 
 
 def _sigma_rows(content: ReportContent) -> list[tuple[str, list[tuple[str, float | None]]]]:

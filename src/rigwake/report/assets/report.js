@@ -255,19 +255,20 @@ function axes(length, names, faint) {
   });
 }
 
-// a level grid with the metres of its lines; drawn below everything
+// a level grid with the metres of its lines, of every second where there is little room; drawn below everything
 function gridParts(grid, faint) {
   if (!grid) return [];
   const [west, south] = grid.low, [east, north] = grid.high, z = grid.z, parts = [];
   const line = (a, b) => parts.push({ line: [a, b], colour: faint, width: 0.7, alpha: 0.45, behind: true });
   const name = (at, words) => parts.push({ text: at, words, colour: faint, small: true });
+  const every = innerWidth < 600 ? 2 : 1;
   grid.x.forEach((x, k) => {
     line([x, south, z], [x, north, z]);
-    name([x, south, z], grid.x_names[k]);
+    if (k % every === 0) name([x, south, z], grid.x_names[k]);
   });
   grid.y.forEach((y, k) => {
     line([west, y, z], [east, y, z]);
-    if (k) name([west, y, z], grid.y_names[k]);
+    if (k && k % every === 0) name([west, y, z], grid.y_names[k]);
   });
   return parts;
 }
