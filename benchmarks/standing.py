@@ -1,6 +1,7 @@
 """What stands on the water, against the truth of six simulated scenes: labels, stixels, ranges, seams, height, buoys.
 
     python benchmarks/standing.py [--folder SHOTS] [--scenes quay marina ..] [--sets 3] [--only labels stixels ..]
+    python benchmarks/standing.py --scenes marina --pictures docs      # the pictures of the documentation
 
 Three scenes are close quarters (`quay`, `marina`, `basin`), three are open (`demo`, `bay`, `buoys`); no network was
 trained on them (`view_shots.py`). Attitude, way and height are the true ones, but where the height is estimated. Range
@@ -38,7 +39,8 @@ from rigwake.views.depth.motion import Earlier
 from rigwake.views.height import estimate_height
 from rigwake.views.scene.label_measures import LabelComparison, flat_horizon
 from rigwake.views.scene.network import shipped_network
-from rigwake.views.scene.segmentation import OBSTACLE, WATER, Labels, PixelClassifier, segment_strip
+from rigwake.views.scene.segmentation import OBSTACLE, WATER, Labels, PixelClassifier, overlay, segment_strip
+from rigwake.views.scene.stixel_files import draw_stixels, range_colours
 from rigwake.views.scene.stixel_source import contact_shifts
 from rigwake.views.scene.stixel_world import StixelWorld, find_stixels
 from rigwake.views.seams import RANGE_EDGES_M, SeamMeter
@@ -327,11 +329,25 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=3, help="frame sets per scene (buoys: twice as many)")
     parser.add_argument("--no-motion", action="store_true", help="match cameras only, no earlier pictures")
     parser.add_argument("--model", type=Path, help="another network (ONNX) in place of the one shipped")
+    parser.add_argument("--pictures", type=Path, help="folder to write pictures of the first frame set to")
     parser.add_argument("--only", nargs="+", default=list(TABLES), choices=TABLES)
     options = parser.parse_args()
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as scratch:
         _tables(options, options.folder or Path(scratch))
+
+
+def write_pictures(seen: Seen, folder: Path) -> None:
+    """Labels, stixels, and found above true ranges of one frame set, as the documentation shows them."""
+    size = (round(1.4 * GRID.columns), round(1.4 * GRID.rows))
+    ranges = np.vstack([range_colours(seen.depth.range_m), range_colours(seen.shot.ranges_m)])
+    for name, picture, rows in (
+        ("segmentation", overlay(seen.strip.image, seen.labels), 1),
+        ("stixels", draw_stixels(seen.strip, seen.world), 1),
+        ("depth", ranges, 2),
+    ):
+        scaled = cv2.resize(picture, (size[0], rows * size[1]), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(folder / f"{name}.jpg"), scaled, [cv2.IMWRITE_JPEG_QUALITY, 80])
 
 
 def _tables(options: argparse.Namespace, folder: Path) -> None:
@@ -344,6 +360,8 @@ def _tables(options: argparse.Namespace, folder: Path) -> None:
         shots = scene_shots(name, options.sets * (2 if name == "buoys" else 1), folder)
         start = time.process_time()
         seen = [estimate(rig, shot, network, not options.no_motion) for shot in shots]
+        if options.pictures is not None:
+            write_pictures(seen[0], options.pictures)
         print(
             f"{name}: {len(shots)} frame sets, {time.process_time() - start:.1f} CPU-s, "
             f"{'close quarters' if name in CLOSE else 'open water'}",
