@@ -7,10 +7,13 @@ import pytest
 
 from rigwake._types import Array
 from rigwake.cameras.models.lens import axis_focal_px
+from rigwake.cameras.moved_lens import moved_lens
 from rigwake.cameras.protocol import CameraModel
+from rigwake.cameras.registry import camera_from_params
 from rigwake.errors import RigwakeError, UsageError
 from rigwake.geometry import so3
 from rigwake.pipeline.lens_finding import field_across_deg, lens_from_tracks, starting_lens
+from rigwake.plausibility.view_pairs import pixel_distances, rays_of
 from rigwake.recording import CameraStream, Frame, main_imu
 from rigwake.simulation.scenario import build_scenario, load_scenario
 from rigwake.simulation.tracks_only import SimulatedTracks, simulate_tracks
@@ -84,7 +87,7 @@ class LitCircle:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("model", "wrong"), [("kb4", 1.1)])
+@pytest.mark.parametrize(("model", "wrong"), [("kb4", 1.1), ("kb4", 0.9), ("mei", 0.9), ("pinhole", 1.1)])
 def test_a_lens_is_found_from_a_field_of_view_ten_per_cent_off(model: str, wrong: float) -> None:
     world = world_seen_by(model)
     stream, tracks = world.recording.cameras["front"], world.tracks["front"]
@@ -96,8 +99,8 @@ def test_a_lens_is_found_from_a_field_of_view_ten_per_cent_off(model: str, wrong
     found = lens_from_tracks(tracks, start, imu)
     assert abs(axis_focal_px(start) / axis_focal_px(true) - 1) > 0.05
     # near enough for the rig to refine it: the noise of tracks at 6 Hz pulls it
-    assert off_px(true, found.found.lens, tracks.pixels) < 5.0
-    assert abs(axis_focal_px(found.found.lens) / axis_focal_px(true) - 1) < 0.03
+    assert off_px(true, found.found.lens, tracks.pixels) < 4.0
+    assert abs(axis_focal_px(found.found.lens) / axis_focal_px(true) - 1) < 0.02
     judged = {score.model: score.held_out_px for score in found.scores if score.found is not None}
     assert judged[found.found.lens.model] <= 1.02 * min(judged.values())
     assert found.found.lens.model in found.words
@@ -121,6 +124,23 @@ def test_an_image_circle_tells_centre_and_scale() -> None:
 def test_nothing_tells_where_to_start() -> None:
     with pytest.raises(UsageError, match="--fov bow=90"):
         starting_lens(stream_of(LitCircle(radius_px=1e6)), None)
+
+
+def test_distances_of_pairs_are_in_pixels() -> None:
+    lens = camera_from_params("kb4", list(KB4.values()), 560, 420)
+    pixels = np.random.default_rng(3).uniform([20, 20], [540, 400], (2, 60, 2))
+    R, t, pair = so3.exp(np.array([[0.1, -0.2, 0.05]])), np.array([[0.6, 0.0, 0.8]]), np.zeros(60, np.int64)
+    a, b = (rays_of(lens, p) for p in pixels)
+    assert (a.seen & b.seen).all()
+    moved, _ = lens.unproject(pixels[0] + [1e-4, 0.0])
+    np.testing.assert_allclose((moved - a.bearings) / 1e-4, a.by_pixels[:, :, 0], atol=1e-6)
+    # a lens twice as long sees the same things twice as far off: in angles they would be equal
+    longer = moved_lens(lens, 2.0, [0.0, 0.0])
+    centre = lens.params[2:4]
+    doubled = (rays_of(longer, centre + 2 * (p - centre)) for p in pixels)
+    np.testing.assert_allclose(
+        pixel_distances(*doubled, R, t, pair), 2 * pixel_distances(a, b, R, t, pair), rtol=1e-6
+    )
 
 
 def test_a_gyroscope_of_another_vessel_tells_no_lens() -> None:

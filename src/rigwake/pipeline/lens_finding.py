@@ -16,29 +16,44 @@ import numpy as np
 
 from rigwake._progress import Progress
 from rigwake._types import Array, Mask
-from rigwake.ba.rig.intrinsics_refinement import moved_px
+from rigwake.ba.rig.intrinsics_refinement import intrinsics_prior, moved_px
 from rigwake.cameras.models.lens import axis_focal_px
+from rigwake.cameras.moved_lens import moved_lens
 from rigwake.cameras.protocol import CameraModel
 from rigwake.cameras.registry import camera_class
 from rigwake.config import CalibrateConfig
 from rigwake.errors import EstimationError, HostError, RigwakeError, UsageError
 from rigwake.odometry.measure import measure_camera
 from rigwake.pipeline.stream_selection import FrameWindow, Selection
-from rigwake.plausibility.gyro_lens import GyroLens, fit_lens_to_gyroscope, pairs_for_lens
+from rigwake.plausibility.gyro_lens import (
+    UNKNOWN,
+    GyroLens,
+    fit_lens_to_gyroscope,
+    held_out_errors_px,
+    pairs_for_lens,
+)
 from rigwake.plausibility.imu_samples import vet_samples
 from rigwake.plausibility.motion_models import MotionScore, compare_models
-from rigwake.plausibility.turn_fit import fit_turns
+from rigwake.plausibility.turn_fit import TurnFit, fit_turns
+from rigwake.plausibility.view_pairs import ViewPairs
 from rigwake.recording import CameraStream, ImuStream
+from rigwake.tracking.camera_rotations import visual_rotations
 from rigwake.tracking.masks import beyond_image_circle
 from rigwake.tracking.track_turns import turns_of_tracks
 from rigwake.tracks import Tracks
+from rigwake.trajectory import Trajectory
 from rigwake.workers import WorkerReport, run_in_processes
 
 _CIRCLE_DEG = 180.0  # across an image circle, if nobody says more
 _PINHOLE_BELOW_DEG = 100.0
 _LEAST_DARK = 0.02  # of the picture, beyond the image circle
 _MOST_FRAMES = 500
-_ROUNDS, _SETTLED_PX = 8, 0.3
+_SCALINGS, _SCALES, _HARDLY = 3, (0.8, 1.25), 0.01
+_ROUNDS, _SETTLED_PX = 3, 0.3
+_BENT, _LONGER = (
+    0.5,
+    0.05,
+)  # other beginnings: of the deviation of what distortion may be; of the focal length
 _UNRELATED = 0.5  # of the turns that the gyroscope does not explain
 _POOR_PX = 1.5
 
@@ -217,16 +232,37 @@ def _find(job: _Job, progress: WorkerReport) -> FoundLens:
     def told(stage: str, done: int, total: int) -> None:
         progress(name, f"finding the lens: {stage}", 0.8 * done / max(total, 1))
 
+    told("comparing its turns with the gyroscope", 0, 1)
+    stream, turns = _turning_as_gyroscope(job.stream, job.imu)
     measured = measure_camera(
-        job.stream,
+        stream,
         job.imu,
         job.config.tracking,
         told,
         hull=job.config.find_self_mask,
         horizon=job.config.horizon,
+        turns=turns,
     )
     progress(name, "finding the lens: comparing camera models", 0.8)
     return lens_from_tracks(measured.tracks, start, job.imu)
+
+
+def _turning_as_gyroscope(stream: CameraStream, imu: ImuStream) -> tuple[CameraStream, Trajectory]:
+    """The camera with its starting lens as long as makes it turn as far as the gyroscope, and its turns by that: points
+    are tracked better by a lens that is nearly right."""
+    turns = visual_rotations(stream)
+    for _ in range(_SCALINGS):
+        try:
+            turn = fit_turns(turns, imu)
+        except RigwakeError:
+            break
+        assert stream.model is not None
+        if turn.unexplained > _UNRELATED or abs(turn.scale - 1) < _HARDLY:
+            break
+        scale = float(np.clip(turn.scale, *_SCALES))
+        stream = replace(stream, model=moved_lens(stream.model, scale, np.zeros(2)))
+        turns = visual_rotations(stream)
+    return stream, turns
 
 
 def lens_from_tracks(tracks: Tracks, start: CameraModel, imu: ImuStream) -> FoundLens:
@@ -234,22 +270,23 @@ def lens_from_tracks(tracks: Tracks, start: CameraModel, imu: ImuStream) -> Foun
 
     Raises UnobservableError, EstimationError where they have too little in common.
     """
-    lens = start
+    lens, found = start, None
+    for _ in range(_SCALINGS):
+        _, turn = _turns_by(lens, tracks, imu)
+        if abs(turn.scale - 1) < _HARDLY:
+            break
+        lens = moved_lens(lens, float(np.clip(turn.scale, *_SCALES)), np.zeros(2))
     for _ in range(_ROUNDS):
-        bearings, seen = lens.unproject(tracks.pixels)
-        turns = turns_of_tracks(replace(tracks, bearings_cam=bearings).take(np.flatnonzero(seen)))
-        turn = fit_turns(turns, imu)
-        if turn.unexplained > _UNRELATED:
-            raise EstimationError(
-                f"{tracks.camera}: the gyroscope explains only {100 * (1 - turn.unexplained):.0f} % of its turns.",
-                remedy="Check --fov, the stamps, and the unit of the gyroscope.",
-            )
+        turns, turn = _turns_by(lens, tracks, imu)
         pairs = pairs_for_lens(tracks, turns)
-        found = fit_lens_to_gyroscope(pairs, lens, imu, turn)
+        begins = _beginnings(lens, start, pairs) if found is None else (lens,)
+        fits = [fit_lens_to_gyroscope(pairs, start, imu, turn, first=first) for first in begins]
+        found = min(fits, key=lambda fit: float(held_out_errors_px(fit, pairs, imu).mean()))
         moved = np.linalg.norm(moved_px(lens, found.lens, pairs.first), axis=1)
         lens = found.lens
         if float(np.sqrt(np.nanmean(moved**2))) < _SETTLED_PX:
             break
+    assert found is not None
     best, scores = compare_models(pairs, found, imu, turn)
     if best.rms_px > _POOR_PX:
         raise EstimationError(
@@ -257,3 +294,29 @@ def lens_from_tracks(tracks: Tracks, start: CameraModel, imu: ImuStream) -> Foun
             remedy="Check --fov and the stamps; give a lens that is roughly right (--camera-file).",
         )
     return FoundLens(start, best, scores)
+
+
+def _turns_by(lens: CameraModel, tracks: Tracks, imu: ImuStream) -> tuple[Trajectory, TurnFit]:
+    """How the camera turned by this lens, and how that compares with the gyroscope; EstimationError if not at all."""
+    bearings, seen = lens.unproject(tracks.pixels)
+    turns = turns_of_tracks(replace(tracks, bearings_cam=bearings).take(np.flatnonzero(seen)))
+    turn = fit_turns(turns, imu)
+    if turn.unexplained > _UNRELATED:
+        raise EstimationError(
+            f"{tracks.camera}: the gyroscope explains only {100 * (1 - turn.unexplained):.0f} % of its turns.",
+            remedy="Check --fov, the stamps, and the unit of the gyroscope.",
+        )
+    return turns, turn
+
+
+def _beginnings(lens: CameraModel, start: CameraModel, pairs: ViewPairs) -> tuple[CameraModel, ...]:
+    """Where to begin: the lens that turns like the gyroscope, and such that are bent inwards and outwards, longer or
+    shorter in the middle in turn. From one alone a fit may end where no lens is."""
+    at = start.param_names.index("k1")
+    std = float(np.sqrt(np.linalg.inv(intrinsics_prior(start, pairs.first, UNKNOWN).information)[at, at]))
+    begins = [lens]
+    for sign in (-1.0, 1.0):
+        params = lens.params.copy()
+        params[at] += sign * _BENT * std
+        begins.append(moved_lens(lens.with_params(params), 1 - sign * _LONGER, np.zeros(2)))
+    return tuple(begins)

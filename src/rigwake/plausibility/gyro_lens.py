@@ -14,9 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigwake._robust import robust_std
-from rigwake._types import Array, Mask, Stamps
+from rigwake._types import Array, Stamps
 from rigwake.ba.rig.intrinsics_refinement import IntrinsicsWidth, intrinsics_prior
-from rigwake.cameras.models.lens import axis_focal_px
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import CameraError, EstimationError
 from rigwake.geometry import so3
@@ -28,7 +27,9 @@ from rigwake.plausibility.view_pairs import (
     direction_of_pairs,
     eliminate_pairs,
     moved_directions,
-    sampson_distances,
+    pixel_distances,
+    rays_at,
+    rays_of,
     scatter_covariance,
     tangents,
 )
@@ -37,13 +38,15 @@ from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
 _FEWEST_PAIRS = 8
-_ROUNDS, _RENEWED = 40, 5
-_MOST_DAMPING, _SETTLED = 1e6, 1e-6
+_ROUNDS, _STEPS = 8, 12
+_MOST_DAMPING, _SETTLED = 1e6, 1e-3
+_REDESCENDS = 3.0  # deviations
+_LEAST_PX = 0.01
 _MOUNT = 7  # rotation, gyro bias, time offset
 _MOUNT_STD = np.array([0.5, 0.5, 0.5, 0.05, 0.05, 0.05, 0.1])
 _MOUNT_STEPS = np.array([1e-5] * 6 + [1e-4])
 _STEP_PX = 0.02
-_WITHOUT_RAY = 0.1  # radians: what a point counts that the lens has no ray for
+_WITHOUT_RAY_PX = 20.0  # what a point counts that the lens has no ray for
 _NO_RAY, _MOST_PX = np.array([0.0, 0.0, 1.0]), 3.0
 _LARGEST = 0.5  # of a parameter's prior deviation, in one step
 
@@ -86,14 +89,21 @@ def pairs_for_lens(tracks: Tracks, turns: Trajectory) -> ViewPairs:
 
 
 def fit_lens_to_gyroscope(
-    pairs: ViewPairs, start: CameraModel, imu: ImuStream, turn: TurnFit, width: IntrinsicsWidth = UNKNOWN
+    pairs: ViewPairs,
+    start: CameraModel,
+    imu: ImuStream,
+    turn: TurnFit,
+    width: IntrinsicsWidth = UNKNOWN,
+    first: CameraModel | None = None,
 ) -> GyroLens:
     """The lens by which pictures turn as the gyroscope does.
 
-    start: the prior's mean; width: its deviations. turn: how the camera's turns compare with the gyroscope's by a lens
-    like `start`.
+    start: the prior's mean; width: its deviations. first: where to begin, if elsewhere. turn: how the camera's turns
+    compare with the gyroscope's by a lens like `start`.
     """
-    return _Problem(pairs, start, integrate_gyro(imu), turn, width).solved(turn)
+    return _Problem(
+        pairs, start, start if first is None else first, integrate_gyro(imu), turn, width
+    ).solved()
 
 
 def held_out_errors_px(found: GyroLens, pairs: ViewPairs, imu: ImuStream) -> Array:
@@ -110,13 +120,9 @@ def held_out_errors_px(found: GyroLens, pairs: ViewPairs, imu: ImuStream) -> Arr
         pairs.first_ns + shift,
         pairs.second_ns + shift,
     )
-    (a, seen_a), (b, seen_b) = (found.lens.unproject(p) for p in (pairs.first, pairs.second))
-    valid = (seen_a & seen_b)[:, None]
-    a, b = np.where(valid, a, _NO_RAY), np.where(valid, b, _NO_RAY)
-    off = sampson_distances(a, b, R, direction_of_pairs(pairs, a, b, R), pairs.pair) * axis_focal_px(
-        found.lens
-    )
-    squares = np.where(valid[:, 0], np.minimum(off**2, _MOST_PX**2), _MOST_PX**2)
+    a, b = (rays_of(found.lens, p) for p in (pairs.first, pairs.second))
+    off = pixel_distances(a, b, R, direction_of_pairs(pairs, a.bearings, b.bearings, R), pairs.pair)
+    squares = np.where(a.seen & b.seen, np.minimum(off**2, _MOST_PX**2), _MOST_PX**2)
     starts = np.searchsorted(pairs.pair, np.arange(len(R)))
     counts = np.bincount(pairs.pair, minlength=len(R))
     return np.asarray(np.sqrt(np.add.reduceat(squares, starts) / counts))
@@ -143,26 +149,29 @@ _Linearised = tuple[Array, Array, Array]
 
 
 class _Problem:
-    """Sampson distances of all pairs by lens and mounting, and their least squares."""
+    """Distances of all pairs by lens and mounting, in pixels, and their least squares."""
 
     def __init__(
-        self, pairs: ViewPairs, start: CameraModel, turned: TurnedImu, turn: TurnFit, width: IntrinsicsWidth
+        self,
+        pairs: ViewPairs,
+        believed: CameraModel,
+        start: CameraModel,
+        turned: TurnedImu,
+        turn: TurnFit,
+        width: IntrinsicsWidth,
     ) -> None:
-        self.pairs, self.start, self.turned = pairs, start, turned
-        self.bias, self.offset_s = turn.gyro_bias, turn.time_offset_s
-        pixels = np.concatenate([pairs.first, pairs.second])
-        count = len(start.params)
-        self.prior = np.zeros((_MOUNT + count, _MOUNT + count))
+        self.pairs, self.believed, self.turned = pairs, believed, turned
+        self.bias, self.offset_s, self.mount = turn.gyro_bias, turn.time_offset_s, turn.imu_from_cam
+        prior = intrinsics_prior(believed, np.concatenate([pairs.first, pairs.second]), width)
+        self.prior = np.zeros((_MOUNT + len(prior.mean), _MOUNT + len(prior.mean)))
         self.prior[:_MOUNT, :_MOUNT] = np.diag(1 / _MOUNT_STD**2)
-        self.prior[_MOUNT:, _MOUNT:] = intrinsics_prior(start, pixels, width).information
+        self.prior[_MOUNT:, _MOUNT:] = prior.information
         self.std = np.sqrt(np.diag(np.linalg.inv(self.prior)))
-        bearings, seen = start.unproject(pixels)
-        moves = np.abs(start.project_with_jacobians(bearings[seen]).d_params).max(axis=(0, 1))
-        self.steps = _STEP_PX / np.maximum(moves, 1e-9)
+        self.first = np.concatenate([np.zeros(_MOUNT), start.params - believed.params])
 
     def lens_at(self, x: Array) -> CameraModel:
         """The lens with these steps of its parameters."""
-        return self.start.with_params(self.start.params + x[_MOUNT:])
+        return self.believed.with_params(self.believed.params + x[_MOUNT:])
 
     def rotations(self, x: Array, X: Array) -> Array:
         """(P, 3, 3) `second_from_first` of every pair by the gyroscope."""
@@ -170,46 +179,65 @@ class _Problem:
         pairs, bias = self.pairs, self.bias + x[3:6]
         return _rotations(pairs, self.turned, X, bias, pairs.first_ns + shift, pairs.second_ns + shift)
 
-    def bearings(self, x: Array) -> tuple[Array, Array, Mask]:
+    def with_directions(self, x: Array, X: Array) -> _State:
+        """The directions that suit a lens and a mounting."""
         lens = self.lens_at(x)
-        (a, seen_a), (b, seen_b) = (lens.unproject(p) for p in (self.pairs.first, self.pairs.second))
-        valid = seen_a & seen_b
-        return np.where(valid[:, None], a, 1.0), np.where(valid[:, None], b, 1.0), valid
+        a, b = (lens.unproject(p)[0] for p in (self.pairs.first, self.pairs.second))
+        seen = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+        a, b = np.where(seen[:, None], a, _NO_RAY), np.where(seen[:, None], b, _NO_RAY)
+        return _State(x, X, direction_of_pairs(self.pairs, a, b, self.rotations(x, X)))
 
-    def solved(self, turn: TurnFit) -> GyroLens:
-        """Levenberg-Marquardt with Cauchy's loss, its width renewed every few steps."""
-        x, X = np.zeros(_MOUNT + len(self.start.params)), turn.imu_from_cam
-        a, b, _ = self.bearings(x)
-        state = _State(x, X, direction_of_pairs(self.pairs, a, b, self.rotations(x, X)))
-        now, damping, size = self._linearised(state), 1e-3, 1.0
-        for done in range(_ROUNDS):
-            if done % _RENEWED == 0:
-                size = max(robust_std(now[0]), 1e-6)
+    def solved(self) -> GyroLens:
+        """Levenberg-Marquardt with a loss that forgets what is far off; its width and the directions, which may be
+        caught where wrong points want them, are renewed between rounds."""
+        state, last = self.with_directions(self.first, self.mount), np.inf
+        for _ in range(_ROUNDS):
+            now = self._linearised(state)
+            size = max(robust_std(now[0]), _LEAST_PX)
+            state, now = self._minimised(state, now, size)
+            again = self.with_directions(state.x, state.X)
+            if self._cost(again, self._errors(again), size) < self._cost(state, now[0], size):
+                state, now = again, self._linearised(again)
+            size = max(robust_std(now[0]), _LEAST_PX)
+            if abs(size - last) < _SETTLED * size:
+                break
+            last = size
+        return self._concluded(state, now, size)
+
+    def _minimised(self, state: _State, now: _Linearised, size: float) -> tuple[_State, _Linearised]:
+        damping = 1e-3
+        for _ in range(_STEPS):
             try:
                 tried = self._stepped(state, now, size, damping)
-                then = self._linearised(tried)
-            except CameraError:  # a lens that cannot be
+                then = self._errors(tried)
+            except (CameraError, np.linalg.LinAlgError):  # a lens that cannot be
                 damping *= 10
                 continue
-            before, after = self._cost(state, now, size), self._cost(tried, then, size)
+            before, after = self._cost(state, now[0], size), self._cost(tried, then, size)
             if not after < before:
                 damping *= 10
                 if damping > _MOST_DAMPING:
                     break
                 continue
-            state, now, damping = tried, then, max(damping / 10, 1e-9)
-            if before - after < _SETTLED * before and done > _RENEWED:
+            state, now, damping = tried, self._linearised(tried), max(damping / 10, 1e-9)
+            if before - after < _SETTLED * before:
                 break
-        return self._concluded(state, now, size)
+        return state, now
 
-    def _cost(self, state: _State, now: _Linearised, size: float) -> float:
+    def _errors(self, state: _State) -> Array:
+        lens, pairs = self.lens_at(state.x), self.pairs
+        a, b = (rays_of(lens, p) for p in (pairs.first, pairs.second))
+        off = pixel_distances(a, b, self.rotations(state.x, state.X), state.t, pairs.pair)
+        return np.where(a.seen & b.seen, off, _WITHOUT_RAY_PX)
+
+    def _cost(self, state: _State, error: Array, size: float) -> float:
+        squares = (error / (_REDESCENDS * size)) ** 2
         known = float(state.x @ self.prior @ state.x)
-        return 4 * float(np.sum(np.log1p((now[0] / (2 * size)) ** 2))) + known
+        return _REDESCENDS**2 * float(np.sum(squares / (1 + squares))) + known
 
     def _stepped(self, state: _State, now: _Linearised, size: float, damping: float) -> _State:
         error, by_t, by_x = now
-        weights = 1 / (1 + (error / (2 * size)) ** 2)
-        reduced, right, back = eliminate_pairs(self.pairs, error, by_t, by_x, weights, damping)
+        reduced, right, back = eliminate_pairs(self.pairs, error, by_t, by_x, _weights(error, size), damping)
         prior = size**2 * self.prior
         damped = reduced + prior + np.diag(damping * np.diag(reduced))
         step = self._solved(damped, right - prior @ state.x)
@@ -227,38 +255,54 @@ class _Problem:
         """Distances (K,), derivatives by directions (K, 2) and by mounting and lens (K, 7 + L); zero where
         not valid."""
         pairs, (x, X, t) = self.pairs, state
-        a, b, valid = self.bearings(x)
-        R = self.rotations(x, X)
-        error = sampson_distances(a, b, R, t, pairs.pair)
+        lens = self.lens_at(x)
+        a, b = (rays_of(lens, p) for p in (pairs.first, pairs.second))
+        R, valid = self.rotations(x, X), a.seen & b.seen
+        error = pixel_distances(a, b, R, t, pairs.pair)
         bases, h = tangents(t), 1e-6
-        by_t = np.stack(
-            [(sampson_distances(a, b, R, t + h * bases[:, :, k], pairs.pair) - error) / h for k in range(2)],
-            axis=1,
-        )
-        columns = []
-        for k, step in enumerate(np.concatenate([_MOUNT_STEPS, self.steps])):
+        by_t = [(pixel_distances(a, b, R, t + h * bases[:, :, k], pairs.pair) - error) / h for k in range(2)]
+        by_x = []
+        for k, step in enumerate(_MOUNT_STEPS):
             off = x.copy()
             off[k] += step
-            if k < _MOUNT:
-                turned = so3.exp(step * np.eye(3)[k]) @ X if k < 3 else X
-                moved = sampson_distances(a, b, self.rotations(off, turned), t, pairs.pair)
-            else:
-                a2, b2, good = self.bearings(off)
-                valid = valid & good
-                moved = sampson_distances(a2, b2, R, t, pairs.pair)
-            columns.append((moved - error) / step)
+            turned = so3.exp(step * np.eye(3)[k]) @ X if k < 3 else X
+            moved = pixel_distances(a, b, self.rotations(off, turned), t, pairs.pair)
+            by_x.append((moved - error) / step)
+        steps = _STEP_PX / np.maximum(np.abs(a.d_params[a.seen]).max(axis=(0, 1)), 1e-9)
+        for k, step in enumerate(steps.tolist()):
+            params = lens.params.copy()
+            params[k] += step
+            off_lens = lens.with_params(params)
+            a2, b2 = (
+                rays_at(
+                    off_lens,
+                    r.bearings - step * np.einsum("kij,kj->ki", r.by_pixels, r.d_params[:, :, k]),
+                    r.seen,
+                )
+                for r in (a, b)
+            )
+            valid &= a2.seen & b2.seen
+            by_x.append((pixel_distances(a2, b2, R, t, pairs.pair) - error) / step)
         keep = valid[:, None]
-        by_x = np.stack(columns, axis=1)
-        return np.where(valid, error, _WITHOUT_RAY), np.where(keep, by_t, 0.0), np.where(keep, by_x, 0.0)
+        return (
+            np.where(valid, error, _WITHOUT_RAY_PX),
+            np.where(keep, np.stack(by_t, axis=1), 0.0),
+            np.where(keep, np.stack(by_x, axis=1), 0.0),
+        )
 
     def _concluded(self, state: _State, now: _Linearised, size: float) -> GyroLens:
         error, by_t, by_x = now
-        weights = 1 / (1 + (error / (2 * size)) ** 2)
+        weights = _weights(error, size)
         reduced, _, _ = eliminate_pairs(self.pairs, error, by_t, by_x, weights, 1e-9)
         information = reduced + size**2 * self.prior
         covariance = scatter_covariance(self.pairs, error, by_t, by_x, weights, information)[_MOUNT:, _MOUNT:]
-        lens = self.lens_at(state.x)
         offset_s = self.offset_s + float(state.x[6])
-        rms_px = robust_std(error) * axis_focal_px(lens)
-        bias = self.bias + state.x[3:6]
-        return GyroLens(lens, state.X, bias, offset_s, rms_px, covariance, len(self.pairs.rotation))
+        return GyroLens(
+            self.lens_at(state.x), state.X, self.bias + state.x[3:6], offset_s, robust_std(error), covariance,
+            len(self.pairs.rotation),
+        )  # fmt: skip
+
+
+def _weights(error: Array, size: float) -> Array:
+    """Of distances (K,) by the loss of Geman and McClure."""
+    return np.asarray(1 / (1 + (error / (_REDESCENDS * size)) ** 2) ** 2)

@@ -12,7 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigwake._types import Array, Indices, Stamps
+from rigwake._kernels import njit
+from rigwake._types import Array, Indices, Mask, Stamps
+from rigwake.cameras.protocol import CameraModel
 from rigwake.geometry import so3
 from rigwake.geometry.interpolate import interpolate
 from rigwake.tracks import Tracks
@@ -21,6 +23,7 @@ from rigwake.trajectory import Trajectory
 _PAIRS = 60
 _LEAST_TURN, _MOST_TURN = np.deg2rad(8.0), np.deg2rad(35.0)
 _LEAST_POINTS, _MOST_POINTS = 25, 150
+_AXIS = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +46,38 @@ class ViewPairs:
             self.first[rows], self.second[rows], np.searchsorted(index, self.pair[rows]), self.rotation[index],
             self.direction[index], self.first_ns[index], self.second_ns[index],
         )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class LitRays:
+    """What a lens makes of pixels: bearings (K, 3), their derivatives by the pixels (K, 3, 2), those of projections by
+    the lens's parameters (K, 2, P), and whether it has a ray for them (K,)."""
+
+    bearings: Array
+    by_pixels: Array
+    d_params: Array
+    seen: Mask
+
+
+def rays_of(lens: CameraModel, pixels: Array) -> LitRays:
+    """Rays of pixels (K, 2); where there is none, the axis."""
+    bearings, seen = lens.unproject(pixels)
+    return rays_at(lens, np.where(seen[:, None], bearings, _AXIS), seen)
+
+
+def rays_at(lens: CameraModel, bearings: Array, seen: Mask) -> LitRays:
+    """The rays of the pixels that bearings (K, 3) have in a lens."""
+    projection = lens.project_with_jacobians(bearings)
+    J = (
+        projection.d_point
+    )  # at right angles to the bearing: its pseudo-inverse is the derivative the other way
+    u, v = J[:, 0], J[:, 1]
+    uu, uv, vv = (np.einsum("ki,ki->k", p, q)[:, None] for p, q in ((u, u), (u, v), (v, v)))
+    area = uu * vv - uv**2
+    seen = seen & projection.valid & (area[:, 0] > 1e-6)
+    area = np.where(seen[:, None], area, 1.0)
+    by_pixels = np.stack([(vv * u - uv * v) / area, (uu * v - uv * u) / area], axis=2)
+    return LitRays(bearings, by_pixels, projection.d_params, seen)
 
 
 def _no_pairs() -> ViewPairs:
@@ -134,6 +169,38 @@ def sampson_distances(a: Array, b: Array, R: Array, t: Array, pair: Indices) -> 
     e = np.einsum("ki,ki->k", b, row)
     squares = np.einsum("ki,ki->k", row, row) + np.einsum("ki,ki->k", column, column) - 2 * e**2
     return np.asarray(e / np.sqrt(np.maximum(squares, 1e-12)))
+
+
+def pixel_distances(a: LitRays, b: LitRays, R: Array, t: Array, pair: Indices) -> Array:
+    """(K,) signed Sampson distances in pixels: by how much both pixels together must move to fit the geometry.
+
+    In angles a lens that is too long has smaller errors, whatever it sees; in pixels it has not.
+    """
+    E = np.ascontiguousarray(so3.hat(t) @ R)
+    return np.asarray(_pixel_distances(E, pair, a.bearings, a.by_pixels, b.bearings, b.by_pixels))
+
+
+@njit(nogil=True)
+def _pixel_distances(E: Array, pair: Indices, a: Array, by_a: Array, b: Array, by_b: Array) -> Array:
+    found = np.empty(len(pair))
+    for k in range(len(pair)):
+        M = E[pair[k]]
+        e, squares = 0.0, 1e-18
+        row, column = np.zeros(3), np.zeros(3)
+        for i in range(3):
+            for j in range(3):
+                row[i] += M[i, j] * a[k, j]
+                column[j] += b[k, i] * M[i, j]
+        for i in range(3):
+            e += b[k, i] * row[i]
+        for m in range(2):
+            g, h = 0.0, 0.0
+            for i in range(3):
+                g += column[i] * by_a[k, i, m]
+                h += row[i] * by_b[k, i, m]
+            squares += g * g + h * h
+        found[k] = e / np.sqrt(squares)
+    return found
 
 
 def eliminate_pairs(
