@@ -27,6 +27,7 @@ from rigwake.intrinsics.saddles import fitted_saddles, normals_of_grid
 from rigwake.intrinsics.select import choose, cross_validate
 
 BOARD = parse_board("aprilgrid:6x6:0.088:0.3")
+SMALL_BOARD = parse_board("aprilgrid:4x4:0.132:0.3")
 DENSE_BOARD = parse_board("aprilgrid:10x10:0.05:0.3")
 NOISE_PX = 0.2
 WIDE = {
@@ -203,7 +204,11 @@ def test_a_parameter_without_effect_is_flagged_not_printed() -> None:
     truth = camera_from_params("kb4", WIDE["kb4"], 640, 480)
     result = calibrate(
         simulated_corners(
-            truth, BOARD, looking_poses(1.1, 8, np.random.default_rng(2), 0.5), 0, np.random.default_rng(0)
+            truth,
+            SMALL_BOARD,
+            looking_poses(1.1, 8, np.random.default_rng(2), 0.5),
+            0,
+            np.random.default_rng(0),
         ),
         "kb23",
     )
