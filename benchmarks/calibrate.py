@@ -56,7 +56,7 @@ PEER_RATE_HZ = 1.0  # all pairs of images are matched: twice the rate takes four
 SMALL = 0.75  # of the presets' pictures
 # name -> preset, significant wave height in metres, receiver
 HONEST: dict[str, tuple[str, float, str]] = {
-    "demo_calm_rtk": ("demo", 0.0, "rtk"),
+    "demo_calm_rtk": ("demo", 0.03, "rtk"),
     "demo_waves_metre": ("demo", 0.25, "metre"),
     "demo_rough_none": ("demo", 0.6, "none"),
     "marina_calm_rtk": ("marina", 0.02, "rtk"),

@@ -171,11 +171,13 @@ def _still_axes(imu: ImuStream, signal: Array) -> dict[str, NDArray[np.bool_]]:
     same = np.diff(signal, axis=0) == 0
     rate = 1e9 / max(float(np.median(np.diff(imu.timestamps_ns))), 1.0) if len(same) else 1.0
     for axis, name in enumerate("xyz"):
+        if same[:, axis].all():
+            continue  # always: see `_silence`
         runs = _runs(same[:, axis])
         usual = float(np.mean(runs[runs < runs.max()])) + 1.0 if (runs < runs.max()).any() else np.inf
         still = runs >= max(_STILL_S * rate, _STILL_RUNS * usual)
         others = np.delete(same, axis, axis=1)[still[1:]]
-        if still.any() and not still.all() and len(others) and others.mean(axis=0).min() < 0.5:
+        if still.any() and len(others) and others.mean(axis=0).min() < 0.5:
             found[name] = still
     return found
 

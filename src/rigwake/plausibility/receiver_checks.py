@@ -18,7 +18,7 @@ from rigwake.plausibility.receiver_fit import (
     frozen_rows,
 )
 from rigwake.plausibility.receiver_repeats import never_moves, repeated_rows, without_heights
-from rigwake.plausibility.receiver_wrongs import check_heights, clock_confusion
+from rigwake.plausibility.receiver_wrongs import check_heights, clock_confusion, rows_of_one_level
 from rigwake.plausibility.values import SensorCheck
 from rigwake.recording import GnssStream
 from rigwake.trajectory import Trajectory
@@ -34,6 +34,7 @@ _LEAST_JUMP_M, _JUMP_STDS = 0.5, 8.0
 _FEWEST = 12
 _STANDING_S, _LEAST_WAY_M = 2.0, 0.8
 _LONGEST_STEP_S = 5.0
+_LOOK = "Check its positions on a map, its stamps and its antenna; or leave it out (--set gnss=false)."
 _REPEATS = "Check the receiver: it repeats its last fix."
 
 
@@ -68,6 +69,7 @@ def vet_receiver(
         return VettedReceiver(None, 0.0, None, (unusable,))
     gnss, found = _without_repeats(gnss, repair)
     checks += found
+    given = len(gnss.timestamps_ns)
     try:
         gnss, found = _without_frozen(gnss, path, time_offset_s, repair)
         checks += found
@@ -75,8 +77,14 @@ def vet_receiver(
         checks += found
         gnss, found = _without_jumps(gnss, path, time_offset_s, repair)
         checks += found
+        gnss, found = _without_height_jumps(gnss, path, time_offset_s, repair)
+        checks += found
         fit = fit_receiver(path, gnss, gnss.position_enu, time_offset_s=time_offset_s)
     except UnobservableError as error:
+        if 2 * len(gnss.timestamps_ns) < given:
+            words = f"only {len(gnss.timestamps_ns)} of its {given} fixes are left that may be right: too few to judge."
+            few = SensorCheck(sensor, False, len(gnss.timestamps_ns), given / 2, words, _LOOK, "fixes left")
+            return VettedReceiver(None, 0.0, None, (*checks, few))
         return VettedReceiver(gnss, 0.0, None, (*checks, SensorCheck(sensor, True, 0.0, 0.0, error.cause)))
     expected = _expected(gnss, fit, level)
     quantity = "horizontal distance of fixes to the cameras' path, m"
@@ -86,10 +94,7 @@ def vet_receiver(
             f"its fixes lie {fit.rms:.2f} m (per axis) off the path that cameras and IMU see, where at most "
             f"{expected:.2f} m is to be expected"
         )
-        remedy = (
-            remedy
-            or "Check its positions on a map, its stamps and its antenna; or leave it out (--set gnss=false)."
-        )
+        remedy = remedy or _LOOK
         check = SensorCheck(sensor, False, fit.rms, expected, f"{words}.", remedy, quantity)
         return VettedReceiver(None, 0.0, fit, (*checks, check))
     if level and (away := _running_away(gnss, path, time_offset_s, fit)) is not None:
@@ -163,7 +168,9 @@ def _confusion(
     best = min(left, key=lambda words: left[words])
     if left[best] > _CLEARLY_BETTER * given.rms:
         return "", ""
-    words = f"{best}: its fixes lie {given.rms:.2f} m off the cameras' path as recorded, {left[best]:.2f} m corrected"
+    # with a heading that is free, one mirrored axis is as good as two that are exchanged
+    alike = " or ".join(sorted(words for words in left if left[words] < 1.2 * left[best] + 0.005))
+    words = f"{alike}: its fixes lie {given.rms:.2f} m off the cameras' path as recorded, {left[best]:.2f} m corrected"
     if clock is not None and best == clock[0]:
         return words, "Correct its stamps."
     return words, "Correct the order and signs of its coordinates."
@@ -319,6 +326,18 @@ def _without_jumps(
         f"it jumps by {excess[first]:.1f} m at {at:.1f} s ({len(jumps)} jumps) where the cameras' path does not; "
         f"{int((~kept).sum())} fixes do not belong to its longest stretch"
     )
+    return _reduced(gnss, kept, words, "Check the reception, or the receiver's change of mode.", repair)
+
+
+def _without_height_jumps(
+    gnss: GnssStream, path: Trajectory, time_offset_s: float, repair: bool
+) -> tuple[GnssStream, list[SensorCheck]]:
+    """The longest stretch between jumps of the height, and stretches as high."""
+    fit = fit_receiver(path, gnss, gnss.position_enu, time_offset_s=time_offset_s)
+    kept = rows_of_one_level(gnss, fit)
+    if kept.all():
+        return gnss, []
+    words = f"its heights jump: {int((~kept).sum())} fixes lie higher or lower than its longest stretch"
     return _reduced(gnss, kept, words, "Check the reception, or the receiver's change of mode.", repair)
 
 

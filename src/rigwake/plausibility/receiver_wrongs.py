@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rigwake._robust import robust_std
 from rigwake._types import Array
@@ -18,6 +19,7 @@ _FOOT = 0.3048
 _WINDOW_S = 8.0  # what changes more slowly in a height may be the path's drift or the receiver's
 _OFF, _CLEARLY_BETTER = 3.0, 0.5
 _LEAST_M = 0.03
+_FEWEST, _LEAST_JUMP_M, _JUMP_STDS, _LONGEST_STEP_S = 12, 0.5, 8.0, 5.0
 _STANDING = 0.2  # of the heave that the path shows
 _LEAP_SECONDS = {
     18.0: "GPS time was taken for UTC (18 s ahead)",
@@ -68,6 +70,29 @@ def check_heights(
     return SensorCheck(
         f"gnss {gnss.name}", False, off, _OFF * noise, words, remedy, "heave beside the path's, m"
     )
+
+
+def rows_of_one_level(gnss: GnssStream, given: ReceiverFit) -> NDArray[np.bool_]:
+    """(G,) fixes without those whose heights lie elsewhere, between jumps, than those of the longest stretch."""
+    p, seconds = gnss.position_enu[:, 2], np.diff(gnss.timestamps_ns) * 1e-9
+    kept = np.ones(len(p), dtype=bool)
+    if len(p) < _FEWEST:
+        return kept
+    speed = np.diff(p) / np.maximum(seconds, 1e-3)
+    nearby = np.array([np.median(speed[max(k - 4, 0) : k + 5]) for k in range(len(speed))])
+    excess = np.where(seconds > _LONGEST_STEP_S, 0.0, np.abs(np.diff(p) - nearby * seconds))
+    limit = max(_LEAST_JUMP_M, _JUMP_STDS * robust_std(excess - np.median(excess)))
+    stretch = np.concatenate([[0], np.cumsum(excess > limit)])
+    of_rows = stretch[given.rows]
+    counts = np.bincount(of_rows, minlength=int(stretch[-1]) + 1)
+    levels = {
+        s: float(np.median(given.residuals[of_rows == s, 2])) for s in np.flatnonzero(counts >= 3).tolist()
+    }
+    if len(levels) < 2:
+        return kept
+    base = levels[int(np.argmax(counts))]
+    alike = [s for s, level in levels.items() if abs(level - base) < limit / 2]
+    return np.isin(stretch, alike) if len(alike) < len(levels) else kept
 
 
 def _within(values: Array, times: Array) -> Array:
