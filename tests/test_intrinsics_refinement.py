@@ -5,13 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import ba_rigs
 from ba_rigs import FISHEYE, Wanted, free_cameras, true_problem
 from calibration_worlds import calibrated, sail
+from rigwake._types import Array
 from rigwake.ba.rig.intrinsics_refinement import (
     JUDGED,
     IntrinsicsWidth,
     holding,
     intrinsics_prior,
+    intrinsics_statistics,
     kept_directions,
     moved_px,
     prior_spreads_of,
@@ -67,6 +70,41 @@ def test_a_long_way_round_tells_the_lens_and_a_moment_does_not() -> None:
         # the lens is right: nothing contradicts it
         assert all(one.untold.shape[1] + one.agreeing.shape[1] == 8 for one in kept.values())
     assert max(known_fraction[0.5]) < min(known_fraction[12.0]), known_fraction
+
+
+class StraightAhead(ba_rigs.Path):
+    """A boat that holds its course on still water."""
+
+    def euler(self, t: Array) -> tuple[Array, Array, Array]:
+        return 0 * t, 0 * t, 0 * t
+
+    def position(self, t: Array) -> Array:
+        return np.stack([1.5 * t, 0 * t, 0 * t], -1)
+
+
+def test_straight_legs_in_a_narrow_field_leave_the_lens_and_name_the_turn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(ba_rigs, "Path", StraightAhead)
+    problem = free_cameras(true_problem(Wanted(cameras=1, seconds=8, state_hz=4.0)), "rig_from_cam")
+    middle = np.linalg.norm(problem.observations.pixels - (320, 240), axis=1) < 120
+    problem = replace(problem, observations=problem.observations.take(np.flatnonzero(middle)))
+    problem = with_free_intrinsics(problem, {})
+    believed, covariance = priors_of(problem), covariance_of(problem)
+    name, lens = problem.cameras[0].name, problem.cameras[0].model
+    kept = kept_directions(problem, covariance, believed)[name]
+    assert kept.untold.shape[1] == 8
+    # whatever the lens was moved by, it is put back
+    off = replace(problem.cameras[0], model=lens.with_params(lens.params * 1.01))
+    held = holding(replace(problem, cameras=(off,)), {name: kept.untold}, JUDGED)
+    np.testing.assert_allclose(held.cameras[0].model.params, lens.params, rtol=1e-6)
+    told = intrinsics_statistics(problem, covariance, {}, believed)[name]
+    assert set(told["not_determined"]) == set(lens.param_names)
+    assert "a turn of 60 degrees or more to both sides" in told["remedy"]
+    assert np.isfinite(told["covariance"]).all()
+    assert all(
+        0.3 * told["prior_std"][p] < std <= 1.01 * told["prior_std"][p] for p, std in told["std"].items()
+    )
 
 
 def test_what_is_held_stays_and_counts_with_its_prior() -> None:

@@ -37,7 +37,6 @@ from rigwake.plausibility.motion_models import MotionScore, compare_models
 from rigwake.plausibility.turn_fit import TurnFit, fit_turns
 from rigwake.plausibility.view_pairs import ViewPairs
 from rigwake.recording import CameraStream, ImuStream
-from rigwake.tracking.camera_rotations import visual_rotations
 from rigwake.tracking.masks import beyond_image_circle
 from rigwake.tracking.track_turns import turns_of_tracks
 from rigwake.tracks import Tracks
@@ -232,37 +231,16 @@ def _find(job: _Job, progress: WorkerReport) -> FoundLens:
     def told(stage: str, done: int, total: int) -> None:
         progress(name, f"finding the lens: {stage}", 0.8 * done / max(total, 1))
 
-    told("comparing its turns with the gyroscope", 0, 1)
-    stream, turns = _turning_as_gyroscope(job.stream, job.imu)
     measured = measure_camera(
-        stream,
+        job.stream,
         job.imu,
         job.config.tracking,
         told,
         hull=job.config.find_self_mask,
         horizon=job.config.horizon,
-        turns=turns,
     )
     progress(name, "finding the lens: comparing camera models", 0.8)
     return lens_from_tracks(measured.tracks, start, job.imu)
-
-
-def _turning_as_gyroscope(stream: CameraStream, imu: ImuStream) -> tuple[CameraStream, Trajectory]:
-    """The camera with its starting lens as long as makes it turn as far as the gyroscope, and its turns by that: points
-    are tracked better by a lens that is nearly right."""
-    turns = visual_rotations(stream)
-    for _ in range(_SCALINGS):
-        try:
-            turn = fit_turns(turns, imu)
-        except RigwakeError:
-            break
-        assert stream.model is not None
-        if turn.unexplained > _UNRELATED or abs(turn.scale - 1) < _HARDLY:
-            break
-        scale = float(np.clip(turn.scale, *_SCALES))
-        stream = replace(stream, model=moved_lens(stream.model, scale, np.zeros(2)))
-        turns = visual_rotations(stream)
-    return stream, turns
 
 
 def lens_from_tracks(tracks: Tracks, start: CameraModel, imu: ImuStream) -> FoundLens:
@@ -310,11 +288,12 @@ def _turns_by(lens: CameraModel, tracks: Tracks, imu: ImuStream) -> tuple[Trajec
 
 
 def _beginnings(lens: CameraModel, start: CameraModel, pairs: ViewPairs) -> tuple[CameraModel, ...]:
-    """Where to begin: the lens that turns like the gyroscope, and such that are bent inwards and outwards, longer or
-    shorter in the middle in turn. From one alone a fit may end where no lens is."""
+    """Where to begin: the lens that turns like the gyroscope, such as are bent in- and outwards, longer or shorter
+    in the middle in turn, and that of the field of view: near points may pull the turns of a camera that looks aside.
+    From one alone a fit may end where no lens is."""
     at = start.param_names.index("k1")
     std = float(np.sqrt(np.linalg.inv(intrinsics_prior(start, pairs.first, UNKNOWN).information)[at, at]))
-    begins = [lens]
+    begins = [lens, start] if lens is not start else [lens]
     for sign in (-1.0, 1.0):
         params = lens.params.copy()
         params[at] += sign * _BENT * std

@@ -279,17 +279,17 @@ def intrinsics_statistics(
         if "intrinsics" in camera.free and camera.name in believed:
             pixels = problem.observations.pixels[problem.observations.camera_indices == index]
             lens = given.get(camera.name, camera.model)
-            found[camera.name] = _one_camera(
-                camera, covariance, lens, _prior_std(believed[camera.name]), pixels
-            )
+            found[camera.name] = _one_camera(camera, covariance, lens, believed[camera.name], pixels)
     return found
 
 
 def _one_camera(
-    camera: BundleCamera, covariance: RigCovariance, given: CameraModel, before: Array, pixels: Array
+    camera: BundleCamera, covariance: RigCovariance, given: CameraModel, prior: VectorPrior, pixels: Array
 ) -> dict[str, Any]:
-    names = camera.model.param_names
-    spread, _ = covariance.parameter(camera.name, "intrinsics")
+    names, before = camera.model.param_names, _prior_std(prior)
+    spread, known = covariance.parameter(camera.name, "intrinsics")
+    # what the pose can make up for is as open as it was believed to be
+    spread = np.where(known[:, None] & known, spread, np.where(np.eye(len(known)) > 0, before**2, 0.0))
     lost = ~(np.sqrt(np.diag(spread)) < _UNTOLD * before)
     held = frozenset(getattr(camera.model, "fixed_by_default", ()))
     open_names = [name for name, open_ in zip(names, lost, strict=True) if open_ and name not in held]
