@@ -97,8 +97,8 @@ def plane_evidence(
         clear & (np.abs(off) <= _CLEARLY),
         clear & (off < -_CLEARLY),
     )
-    counts = [_around(_counted(points[c], grid)) for c in chosen]
-    return PlaneEvidence(*counts, _around(4 * _counted(tried, grid)))
+    over, near, under = (_around(_counted(points[c], grid)) for c in chosen)
+    return PlaneEvidence(over, near, under, _around(4 * _counted(tried, grid)))
 
 
 def _counted(points: Array, grid: StripGrid) -> Floats:
@@ -150,7 +150,7 @@ def without_ghosts(labels: Labels, looks: Labels, evidence: PlaneEvidence, grid:
     number, count = numbered_around(obstacle)
 
     def total(values: NDArray[np.generic], of: NDArray[np.int32] = number) -> Array:
-        return np.bincount(of.ravel(), np.asarray(values, np.float64).ravel(), count)
+        return np.bincount(of.ravel(), values.ravel().astype(np.float64), count).astype(np.float64)
 
     area = np.maximum(total(obstacle), 1)
     far = (np.arange(grid.rows) < grid.horizon_row + _BELOW_DEG / grid.step_deg)[:, None]
