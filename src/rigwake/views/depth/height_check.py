@@ -150,7 +150,7 @@ def without_ghosts(labels: Labels, looks: Labels, evidence: PlaneEvidence, grid:
     number, count = numbered_around(obstacle)
 
     def total(values: NDArray[np.generic], of: NDArray[np.int32] = number) -> Array:
-        return np.asarray(np.bincount(of.ravel(), np.asarray(values, np.float64).ravel(), count), np.float64)
+        return np.bincount(of.ravel(), values.ravel().astype(np.float64), count).astype(np.float64)
 
     area = np.maximum(total(obstacle), 1)
     far = (np.arange(grid.rows) < grid.horizon_row + _BELOW_DEG / grid.step_deg)[:, None]
