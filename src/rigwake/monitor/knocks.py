@@ -19,6 +19,7 @@ from rigwake.recording import Recording
 from rigwake.tracks import Tracks
 
 _FEWEST_BLOCKS = 3
+_PAIRS_S = 0.33  # between the starts of pairs: calibrate has done the work already, this is a check
 
 
 def knocks_inside(
@@ -44,7 +45,9 @@ def knocks_inside(
     starts = block_starts(known, monitored.rig, motion)
     if len(starts) < _FEWEST_BLOCKS:
         return ()
-    scores = score_blocks(known, monitored.rig, motion, starts_ns=starts)
+    steps = [np.diff(own.timestamps_ns) for own in known.values() if len(own.timestamps_ns) > 1]
+    stride = max(round(_PAIRS_S * 1e9 / float(np.median(np.concatenate(steps)))), 1)
+    scores = score_blocks(known, monitored.rig, motion, starts_ns=starts, stride=stride)
     belief = belief_of(monitored.calibration, scores.cameras, thresholds)
     sentences = []
     for alarm in judge_blocks(scores, belief, monitored.places, thresholds).alarms:

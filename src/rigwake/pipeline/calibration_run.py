@@ -9,6 +9,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from numpy.linalg import LinAlgError
+
 from rigwake import __version__
 from rigwake._progress import Progress
 from rigwake.ba.rig.rig_values import InitialRig
@@ -252,8 +254,9 @@ def _knocks(
     )
     try:
         return knocks_inside(calibration, opened, {name: load_tracks(file) for name, file in files.items()})
-    except (InputError, UnobservableError) as error:
-        return (f"Whether a camera moved during the recording was not checked: {error.cause}",)
+    except (InputError, UnobservableError, LinAlgError) as error:
+        why = getattr(error, "cause", "its tracks tell too little.")
+        return (f"Whether a camera moved during the recording was not checked: {why}",)
 
 
 def _each_camera(
