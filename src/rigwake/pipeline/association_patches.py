@@ -39,7 +39,7 @@ def write_patches(
     }
     before = _tiles(problem, streams, searches.source_cameras, searches.source_stamps, searches, "seen")
     after = _tiles(problem, streams, searches.cameras, searches.stamps, searches, "found")
-    entries = []
+    entries: list[dict[str, Any]] = []
     for k in sorted(before.keys() & after.keys()):
         camera, stamp = int(searches.cameras[k]), int(searches.stamps[k])
         name = f"patch_{len(entries)}.jpg"

@@ -136,7 +136,7 @@ def path_scene(
             for name in dict.fromkeys(names)
             if len(chosen := np.flatnonzero(np.array(names) == name))
         ],
-        "grid": _grid(*box, middle),
+        "grid": _grid(box[0], box[1], middle),
     }
 
 
