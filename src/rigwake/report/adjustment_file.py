@@ -94,9 +94,7 @@ def _series(
     if not np.isfinite(arrays[name]).all() or (std is not None and not (np.isfinite(std) & (std > 0)).all()):
         raise InputError(f"adjustment.npz: not all values of {name} are finite.")
     count = int(arrays.get(f"{sensor}_count", np.array(len(stamps))))
-    return SensorSeries(
-        np.asarray((stamps - start_ns) * 1e-9, np.float64), arrays[name].astype(np.float64), std, count
-    )
+    return SensorSeries(np.asarray((stamps - start_ns) * 1e-9), arrays[name].astype(np.float64), std, count)
 
 
 def _cloud(arrays: Mapping[str, np.ndarray]) -> LandmarkCloud | None:

@@ -97,7 +97,7 @@ def summarise_residuals(arrays: Mapping[str, np.ndarray], lens: CameraModel | No
         image=map_over_image(arrays["pixels"][finite], lens, residuals),
         over_angle=_curve(angle, size, angle_edges),
         over_time=_curve(seconds, size, time_edges),
-        histogram_px=np.asarray((np.arange(HISTOGRAM_BINS) + 0.5) * width, np.float64),
+        histogram_px=np.asarray((np.arange(HISTOGRAM_BINS) + 0.5) * width),
         histogram=np.bincount(bins, minlength=HISTOGRAM_BINS).astype(np.float64),
         scatter=scatter,
         reach_px=reach,
