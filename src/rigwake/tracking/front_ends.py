@@ -143,11 +143,11 @@ class _TrackingRun:
 
     def judge(self, image: Image) -> str:
         """Whether a frame is `usable`, `black` or a `repeated` copy of one before: noise makes no picture twice."""
-        coarse = np.ascontiguousarray(image[::4, ::4])
+        coarse = image[::4, ::4]
         if float(coarse.std()) < _MIN_CONTRAST:
             self.black += 1
             return "black"
-        known = blake2b(coarse, digest_size=16).digest()
+        known = blake2b(coarse.tobytes(), digest_size=16).digest()
         if known in self.shown:
             self.repeated += 1
             return "repeated"
