@@ -103,6 +103,14 @@ def test_heights_in_feet_upside_down_or_not_measured() -> None:
     assert flat.gnss.covariances[:, 2, 2].min() > 1000
 
 
+def test_heights_that_jump_keep_the_longest_stretch() -> None:
+    jumped = gnss().position_enu + np.outer(np.arange(len(gnss().position_enu)) > 90, [0, 0, 2.0])
+    found = vetted(replace(gnss(), position_enu=jumped))
+    assert found.gnss is not None
+    assert len(found.gnss.timestamps_ns) == 91
+    assert any("heights jump" in c.hypothesis and c.action == "repaired" for c in found.checks)
+
+
 @pytest.mark.parametrize("times", [2, 5])
 def test_fixes_that_are_sent_again_count_once(times: int) -> None:
     given = gnss()

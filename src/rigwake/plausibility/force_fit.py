@@ -141,7 +141,7 @@ class ForceEquations:
         x, _, size, _ = self._least(columns[:, others], right[:, others])
         told, shown = columns[:, axis] @ x, right[:, axis]
         told, shown = told - np.median(told), shown - np.median(shown)
-        slope, weights = 1.0, np.ones(len(told))
+        slope, weights = 1.0, np.asarray(np.ones(len(told)))
         for _ in range(6):
             square = max(float(np.sum(weights * told**2)), 1e-12)
             slope = float(np.sum(weights * told * shown)) / square
@@ -164,15 +164,15 @@ class ForceEquations:
         n, axes = right.shape
         A, b = columns.reshape(-1, 10), right.reshape(-1)
         prior = np.zeros(10)
-        weights, size = np.ones(n), 0.1
+        weights: Array = np.ones(n)
         x: Array = np.zeros(10)
-        H: Array = np.eye(10)
+        size, H = 0.1, np.eye(10)
         for _ in range(8):
             prior[4:7], prior[7:] = (size / _LEVER_STD) ** 2, (size / _BIAS_STD) ** 2
             w = np.repeat(weights, axes)
             H = (A * w[:, None]).T @ A + np.diag(prior) + 1e-12 * np.eye(10) * self.unit**2
-            x = np.asarray(np.linalg.solve(H, A.T @ (w * b)), np.float64)
-            off = np.asarray(np.linalg.norm((A @ x - b).reshape(-1, axes), axis=1))
+            x = np.asarray(np.linalg.solve(H, A.T @ (w * b)), dtype=np.float64)
+            off = np.linalg.norm((A @ x - b).reshape(-1, axes), axis=1)
             size = max(float(np.median(off)) / _MEDIAN_LENGTH[axes], 1e-4)
             weights = 1 / (1 + (off / (3 * size)) ** 2)
         return x, H, size, off

@@ -24,13 +24,15 @@ def axis_gains(fit: TurnFit) -> tuple[Array, Array]:
     """
     turns, gyro = fit.camera_turns, gyro_turns(fit)
     turns, gyro = turns - np.median(turns, axis=0), gyro - np.median(gyro, axis=0)
-    weights = np.ones(len(turns))
+    weights: Array = np.ones(len(turns))
     matrix: Array = np.eye(3)
     information: Array = np.eye(3)
     off = np.zeros_like(gyro)
     for _ in range(8):
         information = (turns * weights[:, None]).T @ turns + 1e-12 * np.eye(3)
-        matrix = np.asarray(np.linalg.solve(information, (turns * weights[:, None]).T @ gyro).T, np.float64)
+        matrix = np.asarray(
+            np.linalg.solve(information, (turns * weights[:, None]).T @ gyro).T, dtype=np.float64
+        )
         off = gyro - turns @ matrix.T
         size = np.linalg.norm(off, axis=1)
         weights = 1 / (1 + (size / max(2 * float(np.median(size)), 1e-6)) ** 2)

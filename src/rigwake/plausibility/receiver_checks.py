@@ -77,7 +77,7 @@ def vet_receiver(
         checks += found
         gnss, found = _without_jumps(gnss, path, time_offset_s, repair)
         checks += found
-        gnss, found = _without_height_jumps(gnss, path, time_offset_s, repair)
+        gnss, found = _without_height_jumps(gnss, path, time_offset_s, repair) if level else (gnss, [])
         checks += found
         fit = fit_receiver(path, gnss, gnss.position_enu, time_offset_s=time_offset_s)
     except UnobservableError as error:

@@ -40,7 +40,7 @@ def check_heights(
     Only changes within seconds are compared, and only where they are well above the noise: what the same fixes and the
     same path show in the plane.
     """
-    times = np.asarray(gnss.timestamps_ns[given.rows] * 1e-9, np.float64)
+    times = gnss.timestamps_ns[given.rows].astype(np.float64) * 1e-9
     quick = _within(given.residuals, times)
     stated = float(np.sqrt(np.median(gnss.covariances[given.rows, 2, 2])))
     noise = max(stated, 1.5 * robust_std(quick[:, :2]), _LEAST_M)
@@ -56,7 +56,7 @@ def check_heights(
         fixes = gnss.position_enu * [1.0, 1.0, factor]
         fit = fit_receiver(path, gnss, fixes, time_offset_s=time_offset_s)
         left[words] = robust_std(
-            _within(fit.residuals, np.asarray(gnss.timestamps_ns[fit.rows] * 1e-9, np.float64))[:, 2:]
+            _within(fit.residuals, gnss.timestamps_ns[fit.rows].astype(np.float64) * 1e-9)[:, 2:]
         )
     best = min(left, key=lambda words: left[words])
     heights = _within(gnss.position_enu[given.rows], times)[:, 2:]
