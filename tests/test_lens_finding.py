@@ -100,7 +100,7 @@ def test_a_lens_is_found_from_a_field_of_view_ten_per_cent_off(model: str, wrong
     assert abs(axis_focal_px(start) / axis_focal_px(true) - 1) > 0.05
     # near enough for the rig to refine it: the noise of tracks at 6 Hz pulls it
     assert off_px(true, found.found.lens, tracks.pixels) < 4.0
-    assert abs(axis_focal_px(found.found.lens) / axis_focal_px(true) - 1) < 0.02
+    assert abs(axis_focal_px(found.found.lens) / axis_focal_px(true) - 1) < 0.025
     judged = {score.model: score.held_out_px for score in found.scores if score.found is not None}
     assert judged[found.found.lens.model] <= 1.02 * min(judged.values())
     assert found.found.lens.model in found.words

@@ -183,7 +183,7 @@ class _Problem:
         """The directions that suit a lens and a mounting."""
         lens = self.lens_at(x)
         a, b = (lens.unproject(p)[0] for p in (self.pairs.first, self.pairs.second))
-        seen = np.asarray(np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1))
+        seen = np.isfinite(np.concatenate([a, b], axis=1)).all(axis=1)
         a, b = np.where(seen[:, None], a, _NO_RAY), np.where(seen[:, None], b, _NO_RAY)
         return _State(x, X, direction_of_pairs(self.pairs, a, b, self.rotations(x, X)))
 

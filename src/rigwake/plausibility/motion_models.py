@@ -19,6 +19,7 @@ from rigwake.recording import ImuStream
 
 CANDIDATES_BY_MOTION = ("kb4", "mei", "ds", "scaramuzza", "pinhole")
 _FOLDS = 2
+_HARDLY_WORSE = 0.02
 _PINHOLE_REACH = np.deg2rad(75.0)
 _FAR_PX, _SEES = 8.0, 0.97  # from where it started; part of the points that it has a ray for
 _NEAR = IntrinsicsWidth(focal=0.05, centre_px=15.0, distortion=0.1, aspect=0.002)
@@ -49,7 +50,7 @@ def compare_models(
     all scores.
 
     near: a lens that is nearly right, where every model starts. As well: worse by less than the standard error of the
-    difference, pair by pair. `near` itself where no model can be fitted.
+    difference, pair by pair, and by less than 2 %. `near` itself where no model can be fitted.
     """
     turn = replace(
         turn, imu_from_cam=near.imu_from_cam, gyro_bias=near.gyro_bias, time_offset_s=near.time_offset_s
@@ -72,7 +73,8 @@ def compare_models(
 
 def _is_as_good(errors: Array, best: Array) -> bool:
     worse = errors - best
-    return bool(worse.mean() <= worse.std(ddof=1) / np.sqrt(len(worse)))
+    chance = worse.std(ddof=1) / np.sqrt(len(worse))
+    return bool(worse.mean() <= min(chance, _HARDLY_WORSE * best.mean()))
 
 
 def _score(
