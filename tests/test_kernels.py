@@ -50,6 +50,19 @@ def test_code_of_former_sources_is_removed(tmp_path: Path) -> None:
     assert (new.load("floats"), new.load("integers")) == ("new code", "more code")
 
 
+def test_code_of_another_python_is_kept_and_a_damaged_index_is_no_obstacle(tmp_path: Path) -> None:
+    other = KernelFile(str(tmp_path), "kernel-12.py310", "new")
+    other._version = "another numba"
+    other.save("floats", "code of another Python")
+    (tmp_path / "kernel-10.py311.nbi").write_bytes(b"cut")
+    being_written = tmp_path / "kernel-10.py311.1.nbc.tmp.0a"
+    being_written.touch()
+    KernelFile(str(tmp_path), "kernel-12.py311", "new").save("floats", "new code")
+    assert other.load("floats") == "code of another Python"
+    assert not (tmp_path / "kernel-10.py311.nbi").exists()
+    assert being_written.exists()
+
+
 def test_one_file_for_each_set_of_argument_types_of_a_kernel() -> None:
     @njit()
     def doubled(value: Any) -> Any:

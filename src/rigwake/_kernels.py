@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from glob import escape
 from pathlib import Path
 from typing import Any
@@ -32,14 +33,22 @@ class KernelFile(IndexDataCacheFile):
         super()._save_index(overloads)
         folder, own = Path(self._cache_path), self._index_name.removesuffix(".nbi")
         outdated = set(folder.glob(f"{escape(own)}.*.nbc")) - {folder / name for name in overloads.values()}
-        for index in folder.glob(f"{escape(own.rpartition('-')[0])}-*.nbi"):
-            if (
-                index.stem != own
-                and not KernelFile(str(folder), index.stem, self._source_stamp)._load_index()
-            ):
-                outdated |= set(folder.glob(f"{escape(index.stem)}.*"))
+        name, _, place = own.rpartition("-")
+        python = place.partition(".")[2]  # another Python, with another numba perhaps, keeps its own
+        for index in folder.glob(f"{escape(name)}-*.{escape(python)}.nbi"):
+            if index.stem != own and not self._is_current(index):
+                # whole files only: a process of the former source may be writing one, and fails without it
+                outdated |= {index, *folder.glob(f"{escape(index.stem)}.*.nbc")}
         for path in outdated:
-            path.unlink(missing_ok=True)
+            with suppress(OSError):  # of another user, or in use: nothing of this kernel depends on it
+                path.unlink(missing_ok=True)
+
+    def _is_current(self, index: Path) -> bool:
+        """Whether the index of a kernel of this name belongs to the source as it is."""
+        try:
+            return bool(KernelFile(str(index.parent), index.stem, self._source_stamp)._load_index())
+        except Exception:  # cut off or unreadable: what pickle raises then is anything
+            return False
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
