@@ -95,7 +95,9 @@ def test_the_correlation_time_is_that_of_the_errors() -> None:
     rng = np.random.default_rng(0)
     off = gauss_markov(rng, len(STAMPS), 0.2, 1.0, 40.0) + rng.normal(0, 0.05, (len(STAMPS), 3))
     found = _correlation_s(STAMPS, off, np.full(3, 0.05), np.ones(3), 20.0)
-    assert 40.0 < found < 90.0  # means over four seconds change less than the error itself
+    assert 30.0 < found < 55.0
+    apart = np.array([k for k in range(len(STAMPS)) if k // 100 % 4 == 0])  # 20 s of every 80
+    assert 25.0 < _correlation_s(STAMPS[apart], off[apart], np.full(3, 0.05), np.ones(3), 20.0) < 65.0
     assert _correlation_s(STAMPS, off, np.full(3, 2.0), np.ones(3), 20.0) == 20.0  # all of it is white
 
 

@@ -97,18 +97,29 @@ def _correlation_s(stamps: Indices, off: Array, white: Array, lasting: Array, be
     """Correlation time from how much the residuals' means change over four seconds, against how large they are."""
     if not (lasting > 0).any():
         return before
-    _, group = np.unique((stamps - stamps[0]) // round(_BIN_S * 1e9), return_inverse=True)
+    bins, group = np.unique((stamps - stamps[0]) // round(_BIN_S * 1e9), return_inverse=True)
     counts = np.bincount(group)
     means = np.stack([np.bincount(group, off[:, k]) for k in range(3)], axis=1) / counts[:, None]
-    if len(means) < 6:
+    changes = np.diff(means, axis=0)[np.diff(bins) == 1]  # over a gap they have had longer
+    if len(changes) < 5:
         return before
-    change = np.mean(np.diff(means, axis=0) ** 2, axis=0) - 2 * white**2 / np.median(counts)
+    change = np.mean(changes**2, axis=0) - 2 * white**2 / np.median(counts)
     chosen = lasting > _WORTH_MODELLING * white
     if not chosen.any():
         return before
     ratio = float(np.median(np.maximum(change[chosen], 1e-12) / (2 * lasting[chosen] ** 2)))
-    tau = -_BIN_S / np.log(np.clip(1 - ratio, 1e-3, 1 - 1e-6))
-    return float(np.clip(tau, _LEAST_TAU_S, _MOST_TAU_S))
+    longest_first = np.geomspace(_MOST_TAU_S, _LEAST_TAU_S, 400)
+    return float(np.interp(ratio, _change_of_means(longest_first), longest_first))
+
+
+def _change_of_means(tau_s: Array) -> Array:
+    """Half the mean square of the change from one four-second mean of the process to the next, over its variance.
+
+    Means change by less than the process does: 2/3 of it where it lasts for much longer than they.
+    """
+    bins = _BIN_S / tau_s
+    lost = -np.expm1(-bins)  # of the correlation, over one bin
+    return np.asarray((2 * (bins - lost) - lost**2) / bins**2)
 
 
 def _between_nodes(errors: LastingErrors, stamps: Indices) -> Array:
