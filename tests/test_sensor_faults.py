@@ -12,6 +12,7 @@ from rigwake.plausibility.force_checks import check_forces, compare_forces
 from rigwake.plausibility.gyro_axes import check_axes
 from rigwake.plausibility.imu_samples import vet_samples
 from rigwake.plausibility.receiver_checks import VettedReceiver
+from rigwake.plausibility.receiver_repeats import repeated_rows
 from rigwake.plausibility.stamp_rates import rate_of_stamps
 from rigwake.plausibility.turn_checks import check_mounts
 from rigwake.recording import GnssStream, ImuStream
@@ -126,6 +127,21 @@ def test_fixes_that_are_sent_again_count_once(times: int) -> None:
     assert found.gnss is not None
     assert set(given.timestamps_ns) >= set(found.gnss.timestamps_ns[:-times].tolist())
     assert any("repeat the one before" in c.hypothesis and c.action == "repaired" for c in found.checks)
+
+
+def test_coarse_digits_of_a_slow_vessel_are_no_fixes_sent_again() -> None:
+    seconds = np.arange(0, 120, 0.2)[:, None]
+    way = np.concatenate(
+        [0.4 * seconds + 3 * np.sin(seconds / 20), 0.3 * seconds, 0.1 * np.sin(seconds)], axis=1
+    )
+    coarse = np.round(way / [0.11, 0.185, 0.1]) * [0.11, 0.185, 0.1]
+    slow = GnssStream(
+        "gnss", np.arange(600) * 200_000_000, coarse, np.tile(np.eye(3), (600, 1, 1)), (54.0, 10.0, 0.0)
+    )
+    assert (np.diff(coarse, axis=0) == 0).all(axis=1).mean() > 0.1
+    assert not repeated_rows(slow).any()
+    again = np.repeat(way[::5], 5, axis=0) * 5  # fine digits, a fix a second sent five times
+    assert repeated_rows(replace(slow, position_enu=again)).mean() > 0.7
 
 
 def test_a_receiver_that_never_moves_is_left_out() -> None:

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rigwake._types import Array
 from rigwake.recording import GnssStream
 
 _LEAST_STEP_M = 0.05  # below, a vessel that lies still or a coarse last digit repeat a position too
+_DIGIT_STEPS, _NO_STEP_M, _LEAST_DIGIT_M = 1.5, 2e-3, 0.01
 _WORTH_A_WORD = 0.02  # of the fixes
 _UNKNOWN_HEIGHT_M = 100.0
 _ONE_HEIGHT_M = 1e-3
@@ -29,7 +31,18 @@ def repeated_rows(gnss: GnssStream) -> NDArray[np.bool_]:
     other = np.flatnonzero(~same)
     run = np.cumsum(~same) - 1
     steps = np.append(np.linalg.norm(np.diff(p[other], axis=0), axis=1), 0.0)
-    return np.asarray(same & (steps[run] > _LEAST_STEP_M))
+    return np.asarray(same & (steps[run] > max(_LEAST_STEP_M, _DIGIT_STEPS * _last_digit(p[other]))))
+
+
+def _last_digit(p: Array) -> float:
+    """Metres of the last digit of fixes (N, 3) that differ: four decimals of a minute are 0.18 m, and a slow vessel
+    stays for several fixes where they are. The least step along an axis along which some fixes do not move."""
+    found = 0.0
+    for steps in np.abs(np.diff(p[:, :2], axis=0)).T:
+        moved = steps[steps > _LEAST_DIGIT_M]
+        if len(moved) and np.mean(steps < _NO_STEP_M) > _WORTH_A_WORD:
+            found = max(found, float(moved.min()))
+    return found
 
 
 def never_moves(gnss: GnssStream) -> bool:
