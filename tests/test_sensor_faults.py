@@ -12,7 +12,9 @@ from rigwake.plausibility.force_checks import check_forces, compare_forces
 from rigwake.plausibility.gyro_axes import check_axes
 from rigwake.plausibility.imu_samples import vet_samples
 from rigwake.plausibility.receiver_checks import VettedReceiver
+from rigwake.plausibility.receiver_fit import ReceiverFit
 from rigwake.plausibility.receiver_repeats import repeated_rows
+from rigwake.plausibility.receiver_wrongs import rows_of_one_level
 from rigwake.plausibility.stamp_rates import rate_of_stamps
 from rigwake.plausibility.turn_checks import check_mounts
 from rigwake.recording import GnssStream, ImuStream
@@ -110,6 +112,19 @@ def test_heights_that_jump_keep_the_longest_stretch() -> None:
     assert found.gnss is not None
     assert len(found.gnss.timestamps_ns) == 91
     assert any("heights jump" in c.hypothesis and c.action == "repaired" for c in found.checks)
+
+
+def test_heights_in_whole_metres_do_not_jump() -> None:
+    p = gnss().position_enu
+    n = len(p)
+    fit = ReceiverFit(1.0, 0.0, 0.0, 0.0, np.zeros((n, 3)), np.arange(n), 0.1, 100.0, np.zeros(2))
+    coarse = p.copy()
+    coarse[:, 2] = np.round(0.8 * np.sin(np.arange(n) / 9))
+    off = replace(fit, residuals=coarse * [0.0, 0.0, 1.0])
+    assert rows_of_one_level(replace(gnss(), position_enu=coarse), off).all()
+    coarse[n // 3 :, 2] += 5.0
+    off = replace(fit, residuals=coarse * [0.0, 0.0, 1.0])
+    assert 0.6 < rows_of_one_level(replace(gnss(), position_enu=coarse), off).mean() < 0.7
 
 
 @pytest.mark.parametrize("times", [2, 5])

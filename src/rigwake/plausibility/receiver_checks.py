@@ -199,17 +199,18 @@ def _unusable(gnss: GnssStream, path: Trajectory, time_offset_s: float) -> Senso
 
 def _without_repeats(gnss: GnssStream, repair: bool) -> tuple[GnssStream, list[SensorCheck]]:
     """Without fixes that were sent again under a new stamp, which count once, and heights that are one number."""
-    flat = without_heights(gnss)
+    flat, checks = without_heights(gnss), []
     if flat is not None:
         words = "all its heights are the same: it does not measure them; they have no weight."
         remedy = "Set the receiver to three dimensions."
         check = SensorCheck(f"gnss {gnss.name}", False, 0.0, 0.0, words, remedy, "range of its heights, m")
-        return (flat, [check.with_action("repaired")]) if repair else (gnss, [check])
+        gnss, checks = (flat, [check.with_action("repaired")]) if repair else (gnss, [check])
     repeated = repeated_rows(gnss)
     if not repeated.any():
-        return gnss, []
+        return gnss, checks
     words = f"{int(repeated.sum())} of {len(repeated)} fixes repeat the one before to the last digit"
-    return _reduced(gnss, ~repeated, words, _REPEATS, repair)
+    gnss, found = _reduced(gnss, ~repeated, words, _REPEATS, repair)
+    return gnss, [*checks, *found]
 
 
 def _without_frozen(

@@ -20,6 +20,7 @@ _WINDOW_S = 8.0  # what changes more slowly in a height may be the path's drift 
 _OFF, _CLEARLY_BETTER = 3.0, 0.5
 _LEAST_M = 0.03
 _FEWEST, _LEAST_JUMP_M, _JUMP_STDS, _LONGEST_STEP_S = 12, 0.5, 8.0, 5.0
+_DIGIT_STEPS, _LEAST_DIGIT_M, _FEWEST_MOVED = 1.5, 0.01, 5
 _STANDING = 0.2  # of the heave that the path shows
 _LEAP_SECONDS = {
     18.0: "GPS time was taken for UTC (18 s ahead)",
@@ -81,7 +82,10 @@ def rows_of_one_level(gnss: GnssStream, given: ReceiverFit) -> NDArray[np.bool_]
     speed = np.diff(p) / np.maximum(seconds, 1e-3)
     nearby = np.array([np.median(speed[max(k - 4, 0) : k + 5]) for k in range(len(speed))])
     excess = np.where(seconds > _LONGEST_STEP_S, 0.0, np.abs(np.diff(p) - nearby * seconds))
-    limit = max(_LEAST_JUMP_M, _JUMP_STDS * robust_std(excess - np.median(excess)))
+    moved = np.abs(np.diff(p))
+    moved = moved[moved > _LEAST_DIGIT_M]
+    digit = float(np.median(moved)) if len(moved) >= _FEWEST_MOVED else 0.0  # heights may be in whole metres
+    limit = max(_LEAST_JUMP_M, _JUMP_STDS * robust_std(excess - np.median(excess)), _DIGIT_STEPS * digit)
     stretch = np.concatenate([[0], np.cumsum(excess > limit)])
     of_rows = stretch[given.rows]
     counts = np.bincount(of_rows, minlength=int(stretch[-1]) + 1)
