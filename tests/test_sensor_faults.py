@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from rigwake.geometry import so3
+from rigwake.pipeline import sensor_checks
 from rigwake.plausibility.coarse_turns import vet_turns
 from rigwake.plausibility.force_checks import check_forces, compare_forces
 from rigwake.plausibility.gyro_axes import check_axes
 from rigwake.plausibility.imu_samples import vet_samples
+from rigwake.plausibility.lens_fit import LensFit
 from rigwake.plausibility.receiver_checks import VettedReceiver
 from rigwake.plausibility.receiver_fit import ReceiverFit
 from rigwake.plausibility.receiver_repeats import repeated_rows
@@ -19,7 +21,7 @@ from rigwake.plausibility.stamp_rates import rate_of_stamps
 from rigwake.plausibility.turn_checks import check_mounts
 from rigwake.recording import GnssStream, ImuStream
 from rigwake.tracking.front_ends import _TrackingRun
-from test_plausibility import drifting, fits, gnss, imu, paths, vetted, wrong
+from test_plausibility import drifting, fits, gnss, imu, paths, vetted, world, wrong
 
 
 def forces(change: Callable[[np.ndarray], np.ndarray]) -> str:
@@ -62,6 +64,17 @@ def test_an_axis_of_the_gyroscope_is_not_the_fault_of_every_camera(axis: int, ga
     assert f"its {'xyz'[axis]} axis shows {gain:.2f}" in wrong(checks)["gyroscope"]
     assert not check_axes(fits(imu()))
     assert not check_axes(fits(imu(calm=True), paths(calm=True)))
+
+
+def test_a_camera_with_a_wrong_lens_says_nothing_of_the_axes(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[set[str]] = []
+    monkeypatch.setattr(sensor_checks, "check_axes", lambda found: asked.append(set(found)) or ())
+    monkeypatch.setattr(sensor_checks, "check_lenses", lambda *_: ())
+    models = {name: camera.model for name, camera in world().recording.cameras.items()}
+    right = LensFit(1.0, np.zeros(2), 1e-8 * np.eye(3), 0.2, 0.2, 30)
+    lenses = {"front": replace(right, scale=1.2), "left": right}
+    sensor_checks.compare_sensors(imu(), {}, models, paths(), lenses=lenses, repair=True)
+    assert asked == [{"left"}]
 
 
 def test_where_no_camera_keeps_its_mounting_it_is_the_imu() -> None:

@@ -49,7 +49,7 @@ def _biases(problem: RigProblem) -> dict[str, Array | Indices]:
 
 def _inertial(problem: RigProblem) -> dict[str, Array | Indices]:
     """Per interval between states, in rig axes: turn (rad) and change of velocity (m/s) less what the IMU says."""
-    if problem.imu is None or len(problem.states) < 2:
+    if problem.imu is None or problem.states.inertial is None or len(problem.states) < 2:
         return {}
     stamps = problem.states.timestamps_ns
     rows = np.flatnonzero(np.diff(stamps) <= round(LONGEST_BRIDGE_S * 1e9))  # sections are not joined

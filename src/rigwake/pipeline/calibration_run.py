@@ -16,7 +16,7 @@ from rigwake._progress import Progress
 from rigwake.ba.rig.rig_values import InitialRig
 from rigwake.calibration import Calibration, save_calibration
 from rigwake.config import CalibrateConfig
-from rigwake.errors import InputError, UnobservableError
+from rigwake.errors import InputError, RigwakeError, UnobservableError
 from rigwake.fingerprint import files_changed_at, input_fingerprint, unchanged
 from rigwake.monitor.knocks import knocks_inside
 from rigwake.pipeline.before_start import (
@@ -254,7 +254,7 @@ def _knocks(
     )
     try:
         return knocks_inside(calibration, opened, {name: load_tracks(file) for name, file in files.items()})
-    except (InputError, UnobservableError, LinAlgError) as error:
+    except (RigwakeError, LinAlgError) as error:  # the result is not written yet: nothing here may cost it
         why = getattr(error, "cause", "its tracks tell too little.")
         return (f"Whether a camera moved during the recording was not checked: {why}",)
 

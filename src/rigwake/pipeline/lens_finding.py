@@ -49,10 +49,8 @@ _LEAST_DARK = 0.02  # of the picture, beyond the image circle
 _MOST_FRAMES = 500
 _SCALINGS, _SCALES, _HARDLY = 3, (0.8, 1.25), 0.01
 _ROUNDS, _SETTLED_PX = 3, 0.3
-_BENT, _LONGER = (
-    0.5,
-    0.05,
-)  # other beginnings: of the deviation of what distortion may be; of the focal length
+# other beginnings: of the deviation of what distortion may be; of the focal length
+_BENT, _LONGER = 0.5, 0.05
 _UNRELATED = 0.5  # of the turns that the gyroscope does not explain
 _POOR_PX = 1.5
 

@@ -133,8 +133,11 @@ def compare_sensors(
     checks += found
     fits, imu, found = _scaled(trajectories, fits, imu, sound, repair)
     checks += [*found, *check_clocks(fits)]
-    # a wrong axis of the gyroscope looks like a mount of every camera that moves
-    checks += check_axes(fits) or check_mounts(fits)
+    # a wrong axis of the gyroscope looks like a mount of every camera that moves; a wrong focal length looks like a
+    # wrong axis: it scales turns about two axes of the camera, not those about the optical axis
+    checks += check_axes({n: f for n, f in fits.items() if n in sound or n not in lenses}) or check_mounts(
+        fits
+    )
     steady = {n: f for n, f in fits.items() if not _is_accused(n, checks)}
     forces = compare_forces(trajectories, imu, steady)
     checks += check_forces(forces)

@@ -68,9 +68,8 @@ def rays_of(lens: CameraModel, pixels: Array) -> LitRays:
 def rays_at(lens: CameraModel, bearings: Array, seen: Mask) -> LitRays:
     """The rays of the pixels that bearings (K, 3) have in a lens."""
     projection = lens.project_with_jacobians(bearings)
-    J = (
-        projection.d_point
-    )  # at right angles to the bearing: its pseudo-inverse is the derivative the other way
+    J = projection.d_point
+    # at right angles to the bearing: its pseudo-inverse is the derivative the other way
     u, v = J[:, 0], J[:, 1]
     uu, uv, vv = (np.einsum("ki,ki->k", p, q)[:, None] for p, q in ((u, u), (u, v), (v, v)))
     area = uu * vv - uv**2
