@@ -27,7 +27,14 @@ from rigwake.geometry import so3
 from rigwake.monitor.block_motion import GyroBias
 from rigwake.monitor.change_detection import likelihood_ratios
 from rigwake.monitor.cues import CUES, joint, score_cues, weighted_cues
-from rigwake.monitor.innovations import Innovations, belief_of, innovations, with_offsets
+from rigwake.monitor.innovations import (
+    Belief,
+    Innovations,
+    belief_of,
+    innovations,
+    innovations_of_motion,
+    with_offsets,
+)
 from rigwake.monitor.judge import Judgement, joint_claim, judge_cues
 from rigwake.monitor.pair_kernels import MOUNTING
 from rigwake.monitor.rig_motion import rig_motion
@@ -101,7 +108,7 @@ class Run:
         value = statistics.value.max(axis=1)
         if names != CUES:
             return np.asarray(value)
-        motion = self._found(self.alone)
+        motion = innovations_of_motion(self.alone, self._belief(self.alone), Thresholds())
         alone = likelihood_ratios(motion, Thresholds()).value.max(axis=1)
         for k in np.flatnonzero(value > alone):
             if not joint_claim(found, motion, statistics, int(k), self.places, Thresholds()):
@@ -109,8 +116,11 @@ class Run:
         return np.asarray(np.maximum(value, alone))
 
     def _found(self, scores: BlockScores) -> Innovations:
+        return innovations(scores, self._belief(scores), Thresholds())
+
+    def _belief(self, scores: BlockScores) -> Belief:
         belief = belief_of(calibration_of(self.rig), scores.cameras, Thresholds())
-        return innovations(scores, with_offsets(belief, scores.H.shape[1], Thresholds()), Thresholds())
+        return with_offsets(belief, scores.H.shape[1], Thresholds())
 
     @property
     def places(self) -> dict[str, np.ndarray]:

@@ -7,6 +7,7 @@ import pytest
 
 from ba_rigs import Wanted, true_problem
 from rigwake.ba.solver.rig_problem import RigProblem
+from rigwake.errors import InputError
 from rigwake.pipeline import adjustment_record
 from rigwake.pipeline.adjustment_record import write_adjustment
 from rigwake.report.adjustment_file import read_adjustment
@@ -68,3 +69,16 @@ def test_without_imu_and_gnss_there_are_landmarks_alone(tmp_path: Path) -> None:
     record = read_adjustment(tmp_path / "adjustment.npz")
     assert record.landmarks is not None
     assert sensor_charts(record) == {}
+
+
+def test_arrays_of_other_shapes_are_refused(tmp_path: Path) -> None:
+    """A column instead of a row would be spread out to a square of all landmarks, or of all times."""
+    path, rows = tmp_path / "adjustment.npz", np.zeros((50_000, 3))
+    column = np.zeros((len(rows), 1), dtype=np.int64)
+    landmarks = {"camera_names": np.array(["left"]), "landmark_counts": np.array([9, 9])}
+    np.savez(path, landmarks_world=rows, landmark_cameras=column, **landmarks)
+    with pytest.raises(InputError, match="disagree"):
+        read_adjustment(path)
+    np.savez(path, gyro_bias=rows, bias_timestamps_ns=column)
+    with pytest.raises(InputError, match="adjustment"):
+        read_adjustment(path)

@@ -19,6 +19,7 @@ from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.logbook.store import Logbook
 from rigwake.monitor.knocks import knocks_inside
+from rigwake.monitor.monitor_page import render_page
 from rigwake.monitor.monitor_report import logged_verdicts, result_to_dict, verdict_line
 from rigwake.monitor.recalibration import _shift, recalibrate
 from rigwake.monitor.run import monitor
@@ -119,6 +120,7 @@ def test_standstill_tells_axes_and_what_would_help() -> None:
         assert "no way made" in verdict.words
         assert "what helps: sailing" in verdict.words
     assert result_to_dict(result)["cues"]["overlap"]["words"] == "overlap: saw nothing"
+    assert all(cue.words in render_page(result, still.recording) for cue in result.cues.values())
 
 
 @pytest.mark.slow

@@ -1,6 +1,8 @@
 """`rigwake surround`: what a person gets, for good input and bad."""
 
 import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import av
@@ -11,9 +13,8 @@ from typer.testing import CliRunner
 
 from rigwake.cli.main import build_app
 from rigwake.errors import InputError, RigwakeError, UsageError
-from rigwake.recording import CameraStream, Recording
+from rigwake.recording import CameraStream, Frame, Recording
 from rigwake.views.frames import FrameWatch, frame_sets, require_fit
-from rigwake.views.stills import ImageFrames
 from view_scenes import HEIGHT_M, PLACES, attitude, four_cameras, photograph, water_and_ring, write_rig
 
 RIG = four_cameras()
@@ -145,6 +146,22 @@ def test_height_that_nobody_knows_is_asked_for(scene: Path, tmp_path: Path) -> N
 def blank(count: int = 8, value: int = 120) -> list[np.ndarray]:
     rng = np.random.default_rng(value)
     return [np.clip(rng.normal(value, 20, (480, 640)), 0, 255).astype(np.uint8) for _ in range(count)]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFrames:
+    """Pictures held in memory, as a frame source."""
+
+    images: tuple[np.ndarray, ...]
+    timestamps_ns: np.ndarray
+
+    def frames(self, indices: Sequence[int] | np.ndarray, *, colour: bool = False) -> Iterator[Frame]:
+        """See `FrameSource.frames`."""
+        for index in indices:
+            image = self.images[int(index)]
+            if not colour and image.ndim == 3:
+                image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+            yield Frame(int(index), int(self.timestamps_ns[index]), image)
 
 
 def recording_of(images: dict[str, list[np.ndarray]], shift_ns: dict[str, int] | None = None) -> Recording:

@@ -80,6 +80,8 @@ def command(
                 soft_wrap=True,
                 highlight=False,
             )
+        for cue in result.cues.values():
+            out.print(f"cue {cue.words}", style="dim", markup=False, highlight=False, soft_wrap=True)
         for note in result.notes:
             out.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
         if result.blamed:

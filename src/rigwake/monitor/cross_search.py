@@ -126,6 +126,8 @@ def _slots(motions: Sequence[BlockMotion | None], times_ns: Indices) -> tuple[In
         reference[near] = found.priors.slots.reference_ns[at[near]]
         velocity[near], bias[near] = found.velocity[at[near]], found.bias.value
         moving |= near
+    if moving.any():
+        bias[~moving] = bias[moving].mean(axis=0)  # the gyro keeps it where the rig makes no way
     return reference, velocity, bias, moving
 
 

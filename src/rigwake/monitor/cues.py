@@ -11,7 +11,14 @@ from rigwake._types import Array
 from rigwake.monitor.block_motion import BlockMotion
 from rigwake.monitor.change_detection import BlockStatistics, glr
 from rigwake.monitor.cross_views import score_cross_views
-from rigwake.monitor.innovations import ROTATION, Belief, innovations, spreads, with_offsets
+from rigwake.monitor.innovations import (
+    ROTATION,
+    Belief,
+    discount_wrong_motion,
+    innovations,
+    spreads,
+    with_offsets,
+)
 from rigwake.monitor.rig_motion import RigMotion
 from rigwake.monitor.score import BLOCK_S, BlockScores, join_blocks
 from rigwake.monitor.thresholds import Thresholds
@@ -54,12 +61,14 @@ def score_cues(
     return {CUES[0]: scores} | {name: join_blocks(p) if p else scores for name, p in parts.items()}
 
 
-def weighted(scores: BlockScores) -> BlockScores:
+def weighted(scores: BlockScores, spread: Array) -> BlockScores:
     """Scores whose covariance is about their `H`: over what rotations scatter within and between blocks up to each.
+
+    spread: of `spreads`.
 
     One number for each block: with one for each camera, `H x = g` of a change x would not hold any more.
     """
-    wide = np.maximum((scores.inflation * spreads(scores)[:, :, ROTATION]).mean(axis=1), 1.0)
+    wide = np.maximum((scores.inflation * spread[:, :, ROTATION]).mean(axis=1), 1.0)
     return replace(
         scores,
         H=scores.H / wide[:, None, None],
@@ -87,7 +96,8 @@ def weighted_cues(cues: Mapping[str, BlockScores]) -> dict[str, BlockScores]:
             rows=scores.rows * counts[:, None],
         )
         more = size - scores.H.shape[1]
-        scores = weighted(scores)
+        spread = spreads(scores)
+        scores = weighted(discount_wrong_motion(scores) if name == CUES[0] else scores, spread)
         own[name] = replace(
             scores,
             H=np.pad(scores.H, ((0, 0), (0, more), (0, more))),

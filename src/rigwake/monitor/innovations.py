@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,8 @@ _FIRST_SPREADS, _FEWEST_DIFFERENCES = (
 )  # until the recording tells: measured over open water
 _MEDIANS = (2.366, 2.366, 0.455)  # of chi-square with three and one degrees of freedom
 _LEAST_OFFSET_S, _LEAST_PLACE_M = 1e-4, 2e-3
+_BIAS_BLOCKS, _FEWEST_BIASES = 12, 3  # whose gyro bias a block's is held against
+_BIAS_SURE = 2.0  # standard deviations as the blocks tell them, up to which biases agree
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +104,46 @@ def with_offsets(belief: Belief, size: int, thresholds: Thresholds) -> Belief:
     return Belief(np.concatenate([belief.mean, np.zeros(size - known)]), covariance)
 
 
-def innovations(scores: BlockScores, belief: Belief, thresholds: Thresholds) -> Innovations:
-    """Clipped scores of every block against the calibration and against the steady state before it."""
-    spread = spreads(scores)
+def discount_wrong_motion(scores: BlockScores) -> BlockScores:
+    """Scores of the motion in which a block counts less, the further its gyro bias lies from that of the blocks before.
+
+    A gyro's bias hardly changes within minutes. On a straight course over open water a wrong bias and a wrong direction
+    of travel fit nearly as well as the true ones, and every camera's step is then wrong by more than `H` says. From
+    scores as they come from `score_blocks`, once.
+    """
+    weight = np.ones(len(scores))
+    known = np.isfinite(scores.bias).all(axis=1)
+    for k in np.flatnonzero(known).tolist():
+        first = max(k - _BIAS_BLOCKS, 0)
+        before = scores.bias[first:k][known[first:k]]
+        if len(before) < _FEWEST_BIASES:
+            continue
+        off = float(np.linalg.norm(scores.bias[k] - np.median(before, axis=0)))
+        weight[k] = min(1.0, (_BIAS_SURE * float(scores.bias_std[k]) / max(off, 1e-12)) ** 2)
+    return replace(
+        scores,
+        H=scores.H * weight[:, None, None],
+        g=scores.g * weight[:, None],
+        sectors=scores.sectors * weight[:, None, None, None, None],
+    )
+
+
+def innovations_of_motion(scores: BlockScores, belief: Belief, thresholds: Thresholds) -> Innovations:
+    """As `innovations`, of the motion's scores, with `discount_wrong_motion`; not joint scores, which hold it already.
+
+    The spread is that of the scores as they are: blocks that count little would make the others look surer.
+    """
+    return innovations(discount_wrong_motion(scores), belief, thresholds, spreads(scores))
+
+
+def innovations(
+    scores: BlockScores, belief: Belief, thresholds: Thresholds, spread: Array | None = None
+) -> Innovations:
+    """Clipped scores of every block against the calibration and against the steady state before it.
+
+    spread: as of `spreads`, which tells it by default.
+    """
+    spread = spreads(scores) if spread is None else spread
     steady = _steady_beliefs(scores, belief, thresholds, spread)
     blocks, cameras = len(scores), len(scores.cameras)
     by_calibration, by_steady = np.zeros((blocks, cameras, 3, 3)), np.zeros((blocks, cameras, 3, 3))

@@ -17,7 +17,7 @@ from rigwake.monitor.change_detection import (
     likelihood_ratios,
     shift_std_m,
 )
-from rigwake.monitor.innovations import Belief, Innovations, innovations, with_offsets
+from rigwake.monitor.innovations import Belief, Innovations, innovations, innovations_of_motion, with_offsets
 from rigwake.monitor.pair_kernels import MOUNTING
 from rigwake.monitor.score import BlockScores
 from rigwake.monitor.states import CameraState, Standing, next_standing
@@ -86,7 +86,8 @@ def judge_cues(
     cameras saw is lost, and in part wrong, once one of them turned.
     """
     found = innovations(together, with_offsets(belief, together.H.shape[1], thresholds), thresholds)
-    sooner = _joint_alarm(found, innovations(alone, belief, thresholds), places, thresholds)
+    motion = innovations_of_motion(alone, belief, thresholds)
+    sooner = _joint_alarm(found, motion, places, thresholds)
     judgement = judge_blocks(alone, belief, places, thresholds, axes, sooner=sooner)
     return replace(judgement, shift_std_m=shift_std_m(found, thresholds))
 
@@ -109,7 +110,7 @@ def judge_blocks(
     """
     names = scores.cameras
     alarms: list[Alarm] = []
-    found = innovations(scores, belief, thresholds)
+    known, found = scores, innovations_of_motion(scores, belief, thresholds)
     statistics = glr(found, thresholds, axes)
     first_found, merged = found, statistics
     explained: set[str] = set()
@@ -128,7 +129,8 @@ def judge_blocks(
             explained.add(best.camera)
             break
         explained.add(best.camera)
-        found = innovations(_released(found.scores, best), belief, thresholds)
+        known = _released(known, best)
+        found = innovations_of_motion(known, belief, thresholds)
         statistics = glr(found, thresholds, axes)
         merged = _merged(merged, statistics, names, explained)
     step, step_std = _steps(first_found)

@@ -55,10 +55,16 @@ def knocks_inside(
         if not alarm.camera or change is None or change.block == 0:
             continue
         seconds = change.block * BLOCK_S
+        turned = f"{alarm.camera}: it turned on its mount by about {change.size_deg:.2f} deg"
+        if change.kind == "ramp":
+            sentences.append(
+                f"{turned}, slowly, from {seconds:.0f} s after the start to the end; the calibration is between. "
+                "Fasten it, and record again."
+            )
+            continue
         sentences.append(
-            f"{alarm.camera}: it turned on its mount by about {change.size_deg:.2f} deg {seconds:.0f} to "
-            f"{seconds + BLOCK_S:.0f} s after the start; the calibration is between before and after. Calibrate from "
-            "the part before or after it: --start, --duration."
+            f"{turned} {seconds:.0f} to {seconds + BLOCK_S:.0f} s after the start; the calibration is between before "
+            "and after. Calibrate from the part before or after it: --start, --duration."
         )
     return tuple(sentences)
 

@@ -51,9 +51,11 @@ def render_page(result: MonitorResult, recording: Recording) -> str:
     keys = "".join(f'<span class="key {css}"></span>{state}' for state, css in CLASSES.items())
     strip = state_strip(scores.cameras, result.judgement.standings)
     ratio = statistic_chart(scores.cameras, result.judgement.statistics.value, result.thresholds.alarm)
+    cues = "".join(f"<li>{escape(cue.words)}</li>" for cue in result.cues.values())
     parts = [
         f'<div class="verdict {tone}"><strong>{escape(summary)}</strong><ul>{lines}</ul>{notes}</div>',
-        f'<section class="card"><h2>Timeline</h2>{strip}<p class="note">{keys}</p>{ratio}</section>',
+        f'<section class="card"><h2>Timeline</h2>{strip}<p class="note">{keys}</p>{ratio}'
+        f'<p class="note">Each cue by itself, likelihood ratio:</p><ul class="note">{cues}</ul></section>',
         *(_evidence(v, result) for v in result.verdicts.values() if v.state is CameraState.DRIFTED),
         *_camera_sections(result),
         _conditions(result),

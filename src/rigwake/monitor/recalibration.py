@@ -55,7 +55,8 @@ def recalibrate(calibration: Calibration, result: MonitorResult) -> Recalibratio
 
     Its place, too, along directions that the motion shows to a centimetre, if it is surely elsewhere; else it stays.
     result: of `monitor` with this calibration. Raises UsageError where no camera, or more than one, is blamed, or the
-    change goes on (ramp); UnobservableError where the rest of the recording does not show the rotation well enough.
+    change goes on (ramp); UnobservableError where the rest of the recording does not show the rotation well enough, or
+    not where a camera is that shifted.
     """
     name, alarm = _shifted_camera(result) or _blamed(result)
     begin, turned = (
@@ -72,6 +73,12 @@ def recalibrate(calibration: Calibration, result: MonitorResult) -> Recalibratio
     rotation, noise, at_new = refined_step(result.tracks, monitored.rig, result.motion, name, turned, starts)
     covariance = noise + _from_others(at_new, name, result)
     moved = _shift(at_new, name, result)
+    if moved is None and alarm.change is None:
+        raise UnobservableError(
+            f"{name} shifted, and the rest of the recording does not show to where.",
+            consequence="A rotation in place of the shift would be wrong: no new calibration was made.",
+            remedy="Record turns to both sides within 15 m of structure, and run `rigwake recalibrate` on that.",
+        )
     if moved is not None:
         rotation = so3.log(so3.exp(moved.rotation) @ so3.exp(rotation))
         covariance = moved.rotation_covariance

@@ -89,7 +89,7 @@ def _series(
     stamps: Stamps = arrays[f"{sensor}_timestamps_ns"].astype(np.int64)
     std = arrays.get(std_name or f"{name}_std")
     shapes = {arrays[name].shape, *(() if std is None else (std.shape,))}
-    if shapes != {(len(stamps), 3)}:
+    if stamps.ndim != 1 or shapes != {(len(stamps), 3)}:
         raise InputError(f"adjustment.npz: the arrays of {name} disagree in length: {sorted(shapes)}.")
     if not np.isfinite(arrays[name]).all() or (std is not None and not (np.isfinite(std) & (std > 0)).all()):
         raise InputError(f"adjustment.npz: not all values of {name} are finite.")
@@ -101,7 +101,7 @@ def _cloud(arrays: Mapping[str, np.ndarray]) -> LandmarkCloud | None:
     if "landmarks_world" not in arrays:
         return None
     points, indices = arrays["landmarks_world"].astype(np.float64), arrays["landmark_cameras"]
-    if points.shape != (len(indices), 3):
+    if indices.ndim != 1 or points.shape != (len(indices), 3):
         raise InputError("adjustment.npz: landmarks and their cameras disagree in length.")
     names = [str(name) for name in arrays["camera_names"].tolist()]
     in_all, placed = (int(x) for x in arrays["landmark_counts"])

@@ -16,7 +16,7 @@ from rigwake.report.content import OverlayPoint, Picture
 
 BUDGET_BYTES = 8_000_000
 _WIDTHS_PX = (960, 720, 540, 400, 300)
-_PATCH_WIDTH_PX = 480
+_PATCH_WIDTH_PX, _MOST_PATCHES = 480, 400
 _QUALITY = 78
 # unused grey, hull orange, water blue, sky light blue: BGRA
 _MASK_COLOURS = np.array(
@@ -45,7 +45,11 @@ def embed_pictures(pictures: Sequence[Picture]) -> tuple[list[EmbeddedPicture], 
     embedded, unreadable = [], []
     whole = sum(picture.kind != "patches" for picture in pictures)  # patches are small however many
     fraction = BUDGET_BYTES * 3 // 4 // max(whole, 1)  # base64 makes four bytes of three
+    patches = 0
     for picture in pictures:
+        patches += picture.kind == "patches"
+        if picture.kind == "patches" and patches > _MOST_PATCHES:
+            continue
         image = picture_or_none(picture.file, cv2.IMREAD_COLOR)
         if image is None:
             unreadable.append(picture.file.name)

@@ -88,7 +88,7 @@ def summarise_residuals(arrays: Mapping[str, np.ndarray], lens: CameraModel | No
     angle_edges = np.arange(0.0, np.nanmax(angle, initial=1.0) + ANGLE_STEP_DEG, ANGLE_STEP_DEG)
     time_edges = np.linspace(0.0, max(float(seconds.max(initial=0.0)), 1e-3), TIME_BINS + 1)
     width = HISTOGRAM_PX / HISTOGRAM_BINS
-    bins = np.minimum((size / width).astype(np.int64), HISTOGRAM_BINS - 1)
+    bins = np.minimum(size / width, HISTOGRAM_BINS - 1).astype(np.int64)
     scatter, reach, beyond = _scatter(residuals)
     return ResidualSummary(
         count=len(size),

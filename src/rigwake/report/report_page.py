@@ -110,7 +110,7 @@ def _values(content: ReportContent) -> dict[str, Any]:
         "steps": _first_guess(content),
         "displacements": lens_displacements(calibration),
         "refined": {
-            name: plain(found)
+            name: _refined(found)
             for name, c in calibration.cameras.items()
             if isinstance(found := c.statistics.get("intrinsics"), Mapping)
         },
@@ -173,6 +173,15 @@ _SIGMA_FLOOR, _SIGMA_CEILING = 1e-4, 1.0  # degrees and metres alike: the ends o
 def _odd_limit_px(association: Any) -> float:
     median = association.get("median_px") if isinstance(association, Mapping) else None
     return odd_limit_px(float(median)) if isinstance(median, int | float) else float("inf")
+
+
+def _refined(found: Mapping[str, Any]) -> dict[str, Any]:
+    """What is said of a refined lens, of a file that may hold anything."""
+    std, names = plain(found.get("std")), plain(found.get("not_determined"))
+    return {
+        "std": std if isinstance(std, Mapping) else {},
+        "not_determined": [str(name) for name in names] if isinstance(names, list) else [],
+    }
 
 
 def _halves(checks: Mapping[str, Any]) -> dict[str, list[list[tuple[str, str]]]]:

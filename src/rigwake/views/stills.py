@@ -2,38 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rigwake._types import Image
 from rigwake.atomic import atomic_path
 from rigwake.errors import InputError
 from rigwake.readers.image_files import FileFrames, first_file_size, image_files
-from rigwake.recording import CameraStream, Frame, Recording
+from rigwake.recording import CameraStream, Recording
 from rigwake.views.sphere_metadata import mark_picture
 
 _JPEG_QUALITY = 92
-
-
-@dataclass(frozen=True, eq=False)
-class ImageFrames:
-    """Pictures held in memory, as a frame source."""
-
-    images: tuple[Image, ...]
-    timestamps_ns: NDArray[np.int64]
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64], *, colour: bool = False) -> Iterator[Frame]:
-        """See `FrameSource.frames`."""
-        for index in indices:
-            image = self.images[int(index)]
-            if not colour and image.ndim == 3:
-                image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-            yield Frame(int(index), int(self.timestamps_ns[index]), image)
 
 
 def picture_per_camera(folder: Path, names: Sequence[str]) -> Recording | None:
