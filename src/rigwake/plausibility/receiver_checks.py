@@ -199,7 +199,8 @@ def _unusable(gnss: GnssStream, path: Trajectory, time_offset_s: float) -> Senso
 
 def _without_repeats(gnss: GnssStream, repair: bool) -> tuple[GnssStream, list[SensorCheck]]:
     """Without fixes that were sent again under a new stamp, which count once, and heights that are one number."""
-    flat, checks = without_heights(gnss), []
+    checks: list[SensorCheck] = []
+    flat = without_heights(gnss)
     if flat is not None:
         words = "all its heights are the same: it does not measure them; they have no weight."
         remedy = "Set the receiver to three dimensions."
