@@ -112,7 +112,7 @@ def discount_wrong_motion(scores: BlockScores) -> BlockScores:
     scores as they come from `score_blocks`, once.
     """
     weight = np.ones(len(scores))
-    known = np.isfinite(scores.bias).all(axis=1)
+    known = np.asarray(np.isfinite(scores.bias).all(axis=1))
     for k in np.flatnonzero(known).tolist():
         first = max(k - _BIAS_BLOCKS, 0)
         before = scores.bias[first:k][known[first:k]]
