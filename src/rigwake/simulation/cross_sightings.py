@@ -8,6 +8,7 @@ import numpy as np
 
 from rigwake._types import Array, Indices
 from rigwake.cameras.protocol import CameraModel
+from rigwake.odometry.indexed_tracks import radians_per_pixel
 from rigwake.simulation.setup import Simulation
 from rigwake.simulation.tracks_only import CameraTruth, _see
 from rigwake.tracks import CrossViews, Tracks
@@ -46,7 +47,7 @@ def simulate_cross_views(
                 kept, seen, stamps, std = found
                 i, j = first[chosen][kept], later[chosen][kept]
                 own = tracks[source]
-                width = _radians_per_pixel(_model(stretches[source], source))
+                width = _axis_resolution(_model(stretches[source], source))
                 std_own = own.std_px[i] * width
                 rows.append(
                     (
@@ -115,7 +116,7 @@ def _look(
     model = _model(stretch, target)
     bearings, valid = model.unproject(np.nan_to_num(pixels))
     kept = np.flatnonzero(inside & valid)
-    std = np.full(len(kept), noise * _radians_per_pixel(model))
+    std = np.full(len(kept), noise * _axis_resolution(model))
     return kept, bearings[kept], stamps[frames[kept]], std
 
 
@@ -125,7 +126,6 @@ def _model(simulation: Simulation, camera: str) -> CameraModel:
     return model
 
 
-def _radians_per_pixel(model: CameraModel) -> float:
-    """At the optical axis."""
-    d_point = model.project_with_jacobians(np.array([[1e-6, 0.0, 1.0]])).d_point[0]
-    return float(np.linalg.det(d_point[:, :2]) ** -0.5)
+def _axis_resolution(model: CameraModel) -> float:
+    """Radians per pixel at the optical axis."""
+    return float(radians_per_pixel(model, np.array([[1e-6, 0.0, 1.0]]))[0])
