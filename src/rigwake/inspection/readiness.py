@@ -88,7 +88,7 @@ def _sensor_checks(inspection: Inspection) -> list[Check]:
             "cameras",
             len(cameras) >= 2 or (len(cameras) == 1 and bool(others)),
             True,
-            f"{len(cameras)} cameras",
+            f"{len(cameras)} camera" + "s" * (len(cameras) != 1),
             "Record at least two cameras, or one with an IMU, GNSS or poses.",
         ),
         Check(

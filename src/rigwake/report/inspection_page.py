@@ -46,9 +46,11 @@ def inspection_page(inspection: Inspection, readiness: Readiness, told: ToldOver
         [
             verdict(_TONES[readiness.word], readiness.word.capitalize(), [readiness.summary]),
             card("What to do differently", listing(readiness.advice)),
-            card("Requirements", table("Requirements", ["check", "measured", "enough"], checks, words=(1,))),
+            card(
+                "Requirements", table("Requirements", ["check", "measured", "enough"], checks, words=(1, 2))
+            ),
             _sensors_card(inspection),
-            card("Findings", table("Findings", ["", "sensor", "finding"], findings, words=(2,))),
+            card("Findings", table("Findings", ["", "sensor", "finding"], findings, words=(1, 2))),
             card("Pictures", grid(*_pictures(inspection))),
             _motion_card(inspection),
             _information_card(inspection, told),
