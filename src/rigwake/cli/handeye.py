@@ -125,10 +125,10 @@ def command(
 
 
 def _print_checks(checks: Sequence[SensorCheck]) -> None:
+    from rigwake.plausibility.handeye_fit import finding_of
+
     for check in checks:
-        agreement = f"{100 * check.statistic:.1f} % of its motion does not agree"
-        words = f"[dim]{escape(check.sensor)}: {agreement}. {escape(check.hypothesis)}[/dim]"
-        out.print(words, soft_wrap=True)
+        out.print(f"[dim]{escape(finding_of(check))}[/dim]", soft_wrap=True)
 
 
 def _name_next_step(output: Path | None, words: list[str]) -> None:

@@ -22,6 +22,7 @@ from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.plausibility.values import SensorCheck
 from rigwake.trajectory import Trajectory
 
+MOTION_LEFT = "part of the motion that does not agree"
 _STRIDE_S = 1.0
 _FEWEST = 5
 _DOUBTFUL, _WRONG = 0.1, 0.3  # of the motion; between them only what a hypothesis explains is wrong
@@ -98,18 +99,17 @@ def check_handeye(
 ) -> tuple[SensorCheck, ...]:
     """One check per member; where it does not agree, with what makes it agree, if anything does."""
     checks = []
-    quantity = "part of the motion that does not agree"
     for member in members:
         fit = fit_of_handeye(reference, member, result)
         sensor = f"trajectory {member.name}"
         note = _clock_note(member, result, options)
         if fit.worst <= _DOUBTFUL:
-            checks.append(SensorCheck(sensor, True, fit.worst, _DOUBTFUL, note, quantity=quantity))
+            checks.append(SensorCheck(sensor, True, fit.worst, _DOUBTFUL, note, quantity=MOTION_LEFT))
             continue
         cause = _cause(reference, member, fit, options)
         agrees = not cause and fit.worst <= _WRONG
         if agrees:
-            checks.append(SensorCheck(sensor, True, fit.worst, _WRONG, note, quantity=quantity))
+            checks.append(SensorCheck(sensor, True, fit.worst, _WRONG, note, quantity=MOTION_LEFT))
             continue
         what = "rotations" if not fit.translation > fit.rotation else "translations"
         words = f"its {what} do not fit {reference.name}: {100 * fit.worst:.0f} % of the motion is left"
@@ -119,8 +119,18 @@ def check_handeye(
             if cause
             else "Check that both show the same body at the same time, and their clocks."
         )
-        checks.append(SensorCheck(sensor, False, fit.worst, _WRONG, words, remedy, quantity))
+        checks.append(SensorCheck(sensor, False, fit.worst, _WRONG, words, remedy, MOTION_LEFT))
     return tuple(checks)
+
+
+def finding_of(check: SensorCheck) -> str:
+    """What a check found, in words."""
+    left = (
+        f"{100 * check.statistic:.1f} % of its motion does not agree. "
+        if check.quantity == MOTION_LEFT
+        else ""
+    )
+    return f"{check.sensor}: {left}{check.hypothesis}".strip()
 
 
 def explain_failure(
@@ -176,7 +186,28 @@ def _cause(
         found = fit.worst
         if found < best:
             best, cause = found, f"{words}: then {100 * found:.1f} % is left"
-    return cause
+    return cause or _scale_cause(reference, member, given, options)
+
+
+def _scale_cause(
+    reference: Trajectory, member: Trajectory, given: HandeyeFit, options: HandeyeOptions | None
+) -> str:
+    """The ratio of lengths that makes both agree, in words, or nothing."""
+    options = options or HandeyeOptions()
+    if options.scale or not member.is_metric:
+        return ""
+    try:
+        result = calibrate_handeye(reference, [member], replace(options, scale=True))
+    except (RigwakeError, ValueError, np.linalg.LinAlgError):
+        return ""
+    left = fit_of_handeye(reference, member, result).worst
+    scales = result.scales.get(member.name, np.zeros((0, 2)))
+    if not len(scales) or not left < _CLEARLY_BETTER * given.worst:
+        return ""
+    return (
+        f"its lengths are {1 / scales[0, 0]:.3f} times those of {reference.name} (--scale estimates that): "
+        f"then {100 * left:.1f} % is left"
+    )
 
 
 def _suspicions(

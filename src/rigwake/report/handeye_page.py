@@ -15,6 +15,7 @@ from rigwake.geometry import so3
 from rigwake.geometry.align import align_points
 from rigwake.geometry.interpolate import interpolate
 from rigwake.handeye.handeye_problem import HandeyeResult, in_one_unit
+from rigwake.plausibility.handeye_fit import finding_of
 from rigwake.plausibility.values import SensorCheck
 from rigwake.report.charts import Series, line_chart, top_view
 from rigwake.report.extrinsics import number, plus_minus, time_offset
@@ -56,19 +57,16 @@ def handeye_page(
             verdict(tone, f"{len(observable)} of {len(result.members)} mountings observable", open_parts),
             _mountings(result),
             card("Do the clocks agree?", *_speeds(result, reference, by_name)),
-            card("Do the motions agree?", *_residuals(result, reference, by_name), listing(_said(checks))),
+            card(
+                "Do the motions agree?",
+                *_residuals(result, reference, by_name),
+                listing(map(finding_of, checks)),
+            ),
             card("Paths from above", *_paths(result, reference, by_name)),
         ],
         f"Reference {result.reference}, {reference.duration_s:.0f} s. Noise: {result.noise}. {result.steps} steps, "
         f"{result.down_weighted} of them down-weighted as outliers.",
     )
-
-
-def _said(checks: Sequence[SensorCheck]) -> list[str]:
-    return [
-        f"{c.sensor}: {100 * c.statistic:.1f} % of its motion does not agree. {c.hypothesis}".strip()
-        for c in checks
-    ]
 
 
 def _mountings(result: HandeyeResult) -> Markup:

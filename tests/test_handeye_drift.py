@@ -1,0 +1,98 @@
+"""Hand-eye: what changes during a recording is named; a scale that is some percent off is estimated."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from handeye_scenes import PORT, drifting, planar, straight, trajectory, wavy
+from rigwake.errors import InputError
+from rigwake.geometry import so3
+from rigwake.geometry.se3 import SE3
+from rigwake.handeye.handeye_problem import HandeyeOptions
+from rigwake.handeye.joint_calibration import calibrate_handeye
+from rigwake.pipeline.handeye_run import run_handeye
+from rigwake.plausibility.handeye_drift import check_steadiness, scale_against_reference
+from rigwake.trajectory import Trajectory
+
+TIMES = np.arange(600) * 0.15
+
+
+def pair(motion=wavy, seed: int = 0, times=TIMES) -> tuple[Trajectory, Trajectory]:
+    rng = np.random.default_rng(seed)
+    poses = (drifting(p, 1e-3, 5e-3, rng) for p in (motion(times), motion(times) * PORT))
+    rig, port = (trajectory(n, p, times) for n, p in zip(("rig", "port"), poses, strict=True))
+    return rig, port
+
+
+def refusal(rig: Trajectory, port: Trajectory) -> str:
+    with pytest.raises(InputError) as raised:
+        run_handeye(rig, [port], HandeyeOptions())
+    return str(raised.value)
+
+
+@pytest.mark.parametrize("motion", [wavy, planar, straight])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_good_pairs_are_not_accused(motion, seed: int) -> None:
+    rig, port = pair(motion, seed)
+    result = calibrate_handeye(rig, [port])
+    assert check_steadiness(rig, port, result) == ()
+    scale, std = scale_against_reference(rig, port, result)
+    assert abs(scale - 1) < max(4 * std, 0.01)
+
+
+def test_a_scale_some_percent_off_is_estimated_and_said() -> None:
+    rig, port = pair()
+    port = replace(port, world_from_body=scaled(port.world_from_body, 1.05))
+    result, checks, _ = run_handeye(rig, [port], HandeyeOptions())
+    assert [c.action for c in checks] == ["none", "repaired"]
+    assert "1.05" in checks[1].hypothesis
+    off = result.ref_from_members["port"].translation - PORT.translation
+    assert np.linalg.norm(off) < 0.05
+    assert result.scales["port"][0][0] == pytest.approx(1 / 1.05, abs=0.005)
+
+
+def test_a_right_scale_is_left_alone() -> None:
+    result, checks, _ = run_handeye(*_and_list(pair()), HandeyeOptions())
+    assert len(checks) == 1
+    assert len(result.scales.get("port", ())) == 0
+
+
+def test_lengths_half_as_long_again_are_refused() -> None:
+    rig, port = pair()
+    port = replace(port, world_from_body=scaled(port.world_from_body, 1.5))
+    assert "its lengths are 1.50" in refusal(rig, port)
+
+
+def test_a_clock_at_another_rate() -> None:
+    rig, port = pair()
+    stamps = port.timestamps_ns
+    slow = (stamps[0] + (stamps - stamps[0]) * 1.002).astype(np.int64)
+    assert "0.20% faster" in refusal(rig, replace(port, timestamps_ns=slow))
+
+
+def test_a_body_knocked_halfway() -> None:
+    rig, port = pair()
+    knock = SE3(so3.exp(np.radians([0.0, 3.0, 0.0])), np.zeros(3))
+    poses = port.world_from_body
+    turned = SE3(poses.rotation.copy(), poses.translation.copy())
+    after = TIMES >= 50
+    turned.rotation[after] = (poses[after] * knock).rotation
+    said = refusal(rig, replace(port, world_from_body=turned))
+    assert "turned by 3.0 deg on the rig, about 50 s" in said
+
+
+def test_a_frozen_pose() -> None:
+    rig, port = pair()
+    poses = port.world_from_body
+    held = SE3(poses.rotation.copy(), poses.translation.copy())
+    held.rotation[200:260], held.translation[200:260] = poses.rotation[200], poses.translation[200]
+    assert "exactly the same from 30.0 to 38." in refusal(rig, replace(port, world_from_body=held))
+
+
+def scaled(poses: SE3, factor: float) -> SE3:
+    return SE3(poses.rotation, factor * poses.translation)
+
+
+def _and_list(both: tuple[Trajectory, Trajectory]) -> tuple[Trajectory, list[Trajectory]]:
+    return both[0], [both[1]]
