@@ -42,7 +42,7 @@ _LEAST_WAY_M = 0.05  # of a stride, by the reference, while the member is frozen
 
 
 @dataclass(frozen=True)
-class _Strides:
+class _StrideResiduals:
     """Residual twists (N, 6), translation first, of strides, their derivatives (N, 6, 8), the member's own motion
     (N, 6), and their times (N,), seconds from its start."""
 
@@ -53,7 +53,7 @@ class _Strides:
 
 
 @dataclass(frozen=True)
-class _Blocks:
+class _BlockEquations:
     """Normal equations per block: H (K, 8, 8), g (K, 8), middle times (K,) in seconds from the start."""
 
     H: Array
@@ -102,7 +102,7 @@ def scale_against_reference(
     return 1.0 + float(change[_SCALE]), float(np.sqrt(covariance[_SCALE, _SCALE]))
 
 
-def _strides(reference: Trajectory, member: Trajectory, result: HandeyeResult) -> _Strides | None:
+def _strides(reference: Trajectory, member: Trajectory, result: HandeyeResult) -> _StrideResiduals | None:
     camera, X = result.members[member.name], result.ref_from_members[member.name]
     if not np.isfinite(X.matrix).all():
         return None
@@ -134,7 +134,7 @@ def _strides(reference: Trajectory, member: Trajectory, result: HandeyeResult) -
     motion = np.concatenate([B.translation, so3.log(B.rotation)], axis=1)
     if known.sum() < _FEWEST_STRIDES:
         return None
-    return _Strides(
+    return _StrideResiduals(
         around[known], jacobian[known], np.where(np.abs(motion) < 1e-7, 0.0, motion)[known], times[known]
     )
 
@@ -155,7 +155,7 @@ def _scaled(member: Trajectory, result: HandeyeResult) -> SE3:
     scales = result.scales.get(member.name)
     if scales is None or not len(scales):
         return member.world_from_body
-    _, number = np.unique(member.segment_ids, return_inverse=True)
+    _, number = np.unique(np.asarray(member.segment_ids), return_inverse=True)
     size = scales[np.minimum(number, len(scales) - 1), 0]
     return SE3(member.world_from_body.rotation, member.world_from_body.translation * size[:, None])
 
@@ -174,7 +174,7 @@ def _derivatives(B: SE3, by_offset: Array) -> Array:
     return J
 
 
-def _blocks(strides: _Strides) -> _Blocks:
+def _blocks(strides: _StrideResiduals) -> _BlockEquations:
     """Normal equations per block, with Huber's weights around the fit of all."""
     r, J = strides.residuals, strides.jacobian
     change = np.zeros(8)
@@ -193,14 +193,14 @@ def _blocks(strides: _Strides) -> _Blocks:
     H_blocks, g_blocks = np.zeros((len(kinds), 8, 8)), np.zeros((len(kinds), 8))
     np.add.at(H_blocks, block, weight[:, None, None] * (np.swapaxes(white_J, 1, 2) @ white_J))
     np.add.at(g_blocks, block, weight[:, None] * np.einsum("nij,ni->nj", white_J, white_r))
-    return _Blocks(H_blocks, g_blocks, (kinds + 0.5) * _BLOCK_S)
+    return _BlockEquations(H_blocks, g_blocks, np.asarray((kinds + 0.5) * _BLOCK_S))
 
 
 def _spread(values: Array) -> float:
     return float(1.4826 * np.median(np.abs(values)))
 
 
-def _variance_between_neighbours(blocks: _Blocks) -> float:
+def _variance_between_neighbours(blocks: _BlockEquations) -> float:
     """By how much neighbouring blocks differ more than independent residuals would let them; a median, so that one
     change does not count."""
     prior = np.diag(_PRIOR_STD**-2)
@@ -221,10 +221,10 @@ def _gain(H: Array, g: Array) -> float:
 def _solve(H: Array, g: Array, variance: float) -> tuple[Array, Array]:
     """Parameters and their covariance."""
     covariance = np.linalg.inv(H + np.diag(_PRIOR_STD**-2) / variance)
-    return covariance @ g, variance * covariance
+    return covariance @ g, np.asarray(variance * covariance)
 
 
-def _check_frozen(strides: _Strides, reference: Trajectory, member: Trajectory) -> SensorCheck | None:
+def _check_frozen(strides: _StrideResiduals, reference: Trajectory, member: Trajectory) -> SensorCheck | None:
     """Exactly the same pose again and again, while the reference moves."""
     held = ~strides.motion.any(axis=1) & (np.linalg.norm(strides.residuals[:, :3], axis=1) > _LEAST_WAY_M)
     times = strides.times_s[held]
@@ -246,7 +246,7 @@ def _check_frozen(strides: _Strides, reference: Trajectory, member: Trajectory) 
 
 
 def _check_rate(
-    blocks: _Blocks, variance: float, reference: Trajectory, member: Trajectory
+    blocks: _BlockEquations, variance: float, reference: Trajectory, member: Trajectory
 ) -> SensorCheck | None:
     """A ninth parameter: seconds of time offset per second."""
     at = blocks.times_s - blocks.times_s.mean()
@@ -270,7 +270,7 @@ def _check_rate(
     )
 
 
-def _check_change(blocks: _Blocks, variance: float, member: Trajectory) -> SensorCheck | None:
+def _check_change(blocks: _BlockEquations, variance: float, member: Trajectory) -> SensorCheck | None:
     """The split into before and after that explains most, if it explains more than chance and odometry's drift."""
     H = blocks.H[:, _MOUNTING, _MOUNTING]
     rest, _ = _solve(blocks.H.sum(axis=0), blocks.g.sum(axis=0), variance)
