@@ -26,7 +26,16 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = ROOT / "docs" / "measurements"
 # tools beside the benchmarks: they measure nothing by themselves, or make inputs
-TOOLS = {"record", "semi_real", "train_segmentation", "segmentation_scenes", "view_shots"}
+TOOLS = {
+    "record",
+    "semi_real",
+    "train_segmentation",
+    "segmentation_scenes",
+    "view_shots",
+    "recording_faults",
+    "monitor_watches",
+    "monitor_roc",
+}
 LIBRARIES = ("rigwake", "numpy", "scipy", "numba", "opencv-contrib-python-headless")
 
 

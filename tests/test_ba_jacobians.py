@@ -142,14 +142,19 @@ def test_poses_motions_and_distance() -> None:
     problem = replace(
         problem, poses=PoseMeasurements(at, some_poses(problem)[at], np.stack([COVARIANCES, COVARIANCES]))
     )
-    check(problem, lambda p, layout: [pose_factors(p, layout)])
-    for camera in (-1, 1):
-        motion = some_poses(problem)[np.array([0, 2])].inverse() * some_poses(problem)[at]
-        relative = RelativeMeasurements(
-            np.array([0, 2]), at, motion, np.stack([COVARIANCES, COVARIANCES]), camera
-        )
-        check(problem, lambda p, layout, relative=relative: [relative_factors(p, layout, relative)])
-    check(problem, lambda p, layout: [distance_factor(p, layout, DistanceMeasurement(0, 4, 1.0, 0.1))])
+    motion = some_poses(problem)[np.array([0, 2])].inverse() * some_poses(problem)[at]
+    relative = [
+        RelativeMeasurements(np.array([0, 2]), at, motion, np.stack([COVARIANCES, COVARIANCES]), camera)
+        for camera in (-1, 1)
+    ]
+    check(
+        problem,
+        lambda p, layout: [
+            pose_factors(p, layout),
+            *(relative_factors(p, layout, one) for one in relative),
+            distance_factor(p, layout, DistanceMeasurement(0, 4, 1.0, 0.1)),
+        ],
+    )
 
 
 def test_baseline_and_priors() -> None:
@@ -157,10 +162,11 @@ def test_baseline_and_priors() -> None:
     a, b = problem.cameras
     mean = (a.rig_from_cam.inverse() * b.rig_from_cam).retract([0.02, 0.01, -0.03, 0.1, 0.2, -0.1])
     baseline = CameraBaseline(0, 1, PosePrior(mean, np.diag([1.0, 2, 3, 4, 5, 0])))
-    check(problem, lambda p, layout: [baseline_factor(p, layout, baseline)])
-
     known = CameraDistance(0, 1, 1.3, 0.02)
-    check(problem, lambda p, layout: [camera_distance_factor(p, layout, known)])
+    check(
+        problem,
+        lambda p, layout: [baseline_factor(p, layout, baseline), camera_distance_factor(p, layout, known)],
+    )
     tape = PosePrior.in_axes_of_a(mean, [np.inf, 0.1, np.inf, 0.02, np.inf, 0.01])
     camera = replace(
         a,

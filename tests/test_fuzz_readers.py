@@ -41,9 +41,9 @@ def failures(folder: Path, seed: int, count: int) -> tuple[int, list[str]]:
 
 
 def test_some_damaged_inputs_are_read_or_refused(tmp_path: Path) -> None:
-    total, wrong = failures(tmp_path / "fuzz", seed=1, count=6)
+    total, wrong = failures(tmp_path / "fuzz", seed=1, count=2)
     assert not wrong, "\n".join(wrong[:10])
-    assert total == 6 * len(INPUTS)
+    assert total == 2 * len(INPUTS)
 
 
 @pytest.mark.slow

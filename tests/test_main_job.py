@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +27,9 @@ from rigwake.config import load_config
 from rigwake.evaluation.rig_errors import RigErrors, evaluate_calibration
 from rigwake.geometry.interpolate import interpolate
 from rigwake.geometry.se3 import SE3
+from rigwake.pipeline import calibration_run
 from rigwake.pipeline.calibration_run import CalibrationRun, calibrate
+from rigwake.pipeline.stream_selection import Selection
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.readers.truth_files import rig_in_frame
 from rigwake.recording import Recording
@@ -37,6 +40,7 @@ from rigwake.writers.write import write_recording
 
 pytestmark = pytest.mark.xdist_group("basin")
 CHI_SQUARE_6 = 22.5  # 99.9 %
+SETTINGS = ("tracking.max_features=250",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +48,7 @@ class Sail:
     recording: Recording
     path: Path
     run: CalibrationRun
+    estimated_from: tuple[Any, ...]
     truth: Rig
     errors: RigErrors
 
@@ -54,9 +59,27 @@ def sail(tmp_path_factory: pytest.TempPathFactory) -> Sail:
     simulated = basin()
     recording = basin_recording(simulated, folder / "memory")
     write_recording(recording, folder / "rec")
-    run = calibrate(folder / "rec", folder / "out", load_config(jobs=1))
+    with pytest.MonkeyPatch.context() as patch:
+        inputs = _noted(patch)
+        run = calibrate(folder / "rec", folder / "out", load_config(None, SETTINGS, jobs=1))
     truth = rig_in_frame(simulated.rig, run.calibration.reference)
-    return Sail(recording, folder / "rec", run, truth, evaluate_calibration(run.calibration, truth))
+    return Sail(
+        recording, folder / "rec", run, inputs[0], truth, evaluate_calibration(run.calibration, truth)
+    )
+
+
+def _noted(patch: pytest.MonkeyPatch, *, stop: type[Exception] | None = None) -> list[tuple[Any, ...]]:
+    """What the rig is estimated from, filled as runs get there; with `stop`, they end there by that."""
+    found, estimate = [], calibration_run.estimate_vetted_rig
+
+    def note(opened: Recording, selection: Selection, *given: Any, **chosen: Any) -> Any:
+        found.append(given)
+        if stop is not None:
+            raise stop
+        return estimate(opened, selection, *given, **chosen)
+
+    patch.setattr(calibration_run, "estimate_vetted_rig", note)
+    return found
 
 
 def _apart(true: SE3, found: SE3) -> tuple[Array, Array]:
@@ -211,16 +234,36 @@ class TestWhatIsLeft:
 
 
 class TestResume:
-    def test_finished_cameras_are_not_tracked_again(self, sail: Sail) -> None:
+    def test_finished_cameras_are_not_tracked_again(
+        self, sail: Sail, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The rig is estimated from the very same once more."""
+
+        class EnoughError(Exception):
+            pass
+
         def refuse(*_: object, **__: object) -> None:
             raise AssertionError("tracked again")
 
-        again = calibrate(sail.path, sail.run.out, load_config(jobs=1), resume=True, run_cameras=refuse)
-        for name, camera in sail.run.calibration.cameras.items():
-            np.testing.assert_array_equal(
-                again.calibration.cameras[name].rig_from_cam.matrix, camera.rig_from_cam.matrix
+        inputs = _noted(monkeypatch, stop=EnoughError)
+        with pytest.raises(EnoughError):
+            calibrate(
+                sail.path,
+                sail.run.out,
+                load_config(None, SETTINGS, jobs=1),
+                resume=True,
+                run_cameras=refuse,
             )
-            np.testing.assert_array_equal(again.calibration.cameras[name].covariance, camera.covariance)
+        (tracks, trajectories, *_), (first_tracks, first_trajectories, *_) = inputs[0], sail.estimated_from
+        assert set(tracks) == set(first_tracks) == set(OFFSETS_MS)
+        for name in OFFSETS_MS:
+            np.testing.assert_array_equal(tracks[name].frame_indices, first_tracks[name].frame_indices)
+            np.testing.assert_array_equal(tracks[name].track_ids, first_tracks[name].track_ids)
+            np.testing.assert_array_equal(tracks[name].pixels, first_tracks[name].pixels)
+            again, before = trajectories[name], first_trajectories[name]
+            np.testing.assert_array_equal(again.timestamps_ns, before.timestamps_ns)
+            np.testing.assert_array_equal(again.world_from_body.matrix, before.world_from_body.matrix)
+            np.testing.assert_array_equal(again.covariances, before.covariances)
 
     @pytest.mark.parametrize(
         "setting", ["tracking.max_features=300", "duration_s=15.5", "find_self_mask=false"]
@@ -232,10 +275,9 @@ class TestResume:
         def note(*_: object, **__: object) -> None:
             raise TrackedError
 
+        config = load_config(None, (*SETTINGS, setting), jobs=1)
         with pytest.raises(TrackedError):
-            calibrate(
-                sail.path, sail.run.out, load_config(None, (setting,), jobs=1), resume=True, run_cameras=note
-            )
+            calibrate(sail.path, sail.run.out, config, resume=True, run_cameras=note)
 
 
 OFFSETS_S = (0.03, -0.02)

@@ -111,6 +111,15 @@ class Tracks:
         """The chosen observations."""
         return take_rows(self, index, keep=("camera", "timestamps_ns", "report"))
 
+    def same_tracks(self, rows: Indices, frames: Indices) -> tuple[Indices, Indices]:
+        """Those of the rows (N,) whose track is observed in `frames` (N,) too, and the rows where it is."""
+        width = int(self.track_ids.max(initial=0)) + 1
+        keys = self.frame_indices * width + self.track_ids
+        wanted = frames * width + self.track_ids[rows]
+        at = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
+        found = keys[at] == wanted
+        return rows[found], at[found]
+
     def save(self, path: Path) -> None:
         """Write a compressed .npz, whole or not at all."""
         with atomic_path(path) as temporary, temporary.open("wb") as file:

@@ -15,7 +15,7 @@ from rigwake.geometry.interpolate import nearest_indices
 from rigwake.geometry.se3 import SE3
 from rigwake.monitor.block_motion import BlockMotion
 from rigwake.monitor.cross_views import inverse_ranges
-from rigwake.monitor.frame_pairs import PAIR_S, frame_partners, radians_per_pixel
+from rigwake.monitor.frame_pairs import PAIR_S, PixelAngles, frame_partners
 from rigwake.monitor.rig_motion import RigMotion
 from rigwake.recording import CameraStream
 from rigwake.rig import Rig
@@ -84,12 +84,7 @@ def _sources(
     seconds = (on_rig - on_rig[0]) // round(PAIR_S * 1e9) if len(on_rig) else on_rig
     starts = np.flatnonzero((np.diff(seconds, prepend=-1) > 0) & (partner >= 0))
     rows = np.flatnonzero(np.isin(tracks.frame_indices, starts))
-    width = int(tracks.track_ids.max(initial=0)) + 1
-    keys = tracks.frame_indices * width + tracks.track_ids
-    wanted = partner[tracks.frame_indices[rows]] * width + tracks.track_ids[rows]
-    at = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
-    kept = keys[at] == wanted
-    rows, later = rows[kept], at[kept]
+    rows, later = tracks.same_tracks(rows, partner[tracks.frame_indices[rows]])
     mounted = rig.camera(tracks.camera)
     u = tracks.bearings_cam[rows] @ mounted.rig_from_cam.rotation.T
     first_ns, later_ns = on_rig[tracks.frame_indices[rows]], on_rig[tracks.frame_indices[later]]
@@ -103,7 +98,7 @@ def _sources(
         :, :, 0
     ]
     assert mounted.model is not None
-    resolution = radians_per_pixel(mounted.model)
+    resolution = PixelAngles(mounted.model)
     std = np.stack([resolution(tracks.bearings_cam[k]) * tracks.std_px[k] for k in (rows, later)], axis=1)
     inverse_range, range_std = inverse_ranges(u, after, moved, std, moving)
     near = (inverse_range < 1 / _NEAREST_M) & (inverse_range + 2 * range_std > 0)
@@ -164,7 +159,7 @@ def _proposed(
     valid &= inside(usable, pixels)
     edge = np.array([target.model.width_px, target.model.height_px]) - 1 - _MARGIN_PX
     valid[valid] = ((pixels[valid] > _MARGIN_PX) & (pixels[valid] < edge)).all(axis=1)
-    chosen = _at_most(source.times_ns[rows], valid, _MOST)
+    chosen = _evenly_at_most(source.times_ns[rows], valid, _MOST)
     rows, pixels, target_from_first = rows[chosen], pixels[chosen], target_from_first[chosen]
     searches = _searches(tracks[own], source, rows, stamps[at[rows]], pair, pixels, count)
     first_from_source = SE3(
@@ -181,7 +176,7 @@ def _proposed(
     return warped(searches, mapped, _OPTIONS), rows
 
 
-def _at_most(group: Indices, allowed: Mask, most: int) -> Indices:
+def _evenly_at_most(group: Indices, allowed: Mask, most: int) -> Indices:
     """Allowed rows, at most so many of each group, evenly."""
     chosen = []
     rows = np.flatnonzero(allowed)
@@ -237,7 +232,7 @@ def _views(
     for a, name in enumerate(names):
         own, model = tracks[name], rig.camera(name).model
         assert model is not None
-        resolution = radians_per_pixel(model)
+        resolution = PixelAngles(model)
         mine = np.flatnonzero(source == a)
         for k, index in enumerate((first[mine], later[mine])):
             stamps[mine, k] = own.timestamps_ns[own.frame_indices[index]]

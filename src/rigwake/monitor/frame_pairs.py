@@ -87,19 +87,14 @@ def _pairs_of(tracks: Tracks, rig: Rig, begin_ns: int, end_ns: int, stride: int)
     number = np.full(len(on_rig), -1)
     number[starts] = np.arange(len(starts))
     rows = np.flatnonzero(number[tracks.frame_indices] >= 0)
-    width = int(tracks.track_ids.max()) + 1 if len(tracks) else 1
-    keys = tracks.frame_indices * width + tracks.track_ids  # increasing: sorted by frame, then by track
-    wanted = partner[tracks.frame_indices[rows]] * width + tracks.track_ids[rows]
-    at = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
-    found = keys[at] == wanted if len(keys) else np.zeros(0, dtype=bool)
-    rows, mates = rows[found], at[found]
+    rows, mates = tracks.same_tracks(rows, partner[tracks.frame_indices[rows]])
     counts = np.bincount(number[tracks.frame_indices[rows]], minlength=len(starts))
     enough = counts >= _FEWEST
     renumbered = np.cumsum(enough) - 1
     kept = enough[number[tracks.frame_indices[rows]]]
     rows, mates, starts_kept = rows[kept], mates[kept], starts[enough]
     _, track = np.unique(tracks.track_ids[rows], return_inverse=True)
-    resolution = radians_per_pixel(model)
+    resolution = PixelAngles(model)
     std = np.stack([resolution(tracks.bearings_cam[k]) * tracks.std_px[k] for k in (rows, mates)], axis=1)
     rotation = mounted.rig_from_cam.rotation
     return _OfOne(
@@ -124,7 +119,7 @@ def frame_partners(stamps_ns: Indices) -> Indices:
     return np.where(late | (nearest <= np.arange(len(stamps_ns))), -1, nearest)
 
 
-class radians_per_pixel:  # noqa: N801  used as a function
+class PixelAngles:
     """How wide a pixel is, by the angle off the optical axis: geometric mean over both directions."""
 
     def __init__(self, model: CameraModel) -> None:

@@ -256,7 +256,7 @@ def _charts(
         return [Series(n, c.at, getattr(c, values), colours.get(n, 0)) for n, c in curves.items()]
 
     angle, time = "angle from the axis, degrees", "time, s"
-    charts = {
+    return {
         "angle": line_chart(
             "Residuals against the angle from the optical axis",
             angle,
@@ -290,24 +290,21 @@ def _charts(
             [Series(n, p[:, 0], p[:, 1], colours.get(n, 7)) for n, p in reversed(list(paths.items()))],
             cloud=_cloud_from_above(content.adjustment.landmarks, colours),
         ),
+        **_motion_charts(motion),
     }
-    if motion is not None:
-        yaw, pitch, roll = motion.yaw_pitch_roll_deg.T
-        charts["yaw"] = line_chart(
-            "Yaw over time",
-            "time, s",
-            "yaw, deg",
-            [Series("yaw", motion.at_s, yaw, 0)],
-            from_zero=False,
-        )
-        charts["tilt"] = line_chart(
-            "Roll and pitch over time",
-            "time, s",
-            "roll, pitch, deg",
-            [Series("roll", motion.at_s, roll, 0), Series("pitch", motion.at_s, pitch, 1)],
-            from_zero=False,
-        )
-        charts["speed"] = line_chart(
-            "Speed over time", "time, s", "speed, m/s", [Series("speed", motion.at_s, motion.speed, 0)]
-        )
-    return charts
+
+
+def _motion_charts(motion: MotionFigures | None) -> dict[str, Markup]:
+    """How the rig turned and how fast it went; none without a trajectory of it."""
+    if motion is None:
+        return {}
+    time = "time, s"
+    yaw, pitch, roll = motion.yaw_pitch_roll_deg.T
+    turned = [Series("yaw", motion.at_s, yaw, 0)]
+    tilted = [Series("roll", motion.at_s, roll, 0), Series("pitch", motion.at_s, pitch, 1)]
+    speed = [Series("speed", motion.at_s, motion.speed, 0)]
+    return {
+        "yaw": line_chart("Yaw over time", time, "yaw, deg", turned, from_zero=False),
+        "tilt": line_chart("Roll and pitch over time", time, "roll, pitch, deg", tilted, from_zero=False),
+        "speed": line_chart("Speed over time", time, "speed, m/s", speed),
+    }

@@ -40,7 +40,7 @@ def simulate_cross_views(
             for lag in (False, True):
                 if a == b or not len(first) or most == 0:
                     continue
-                chosen = _at_most(tracks[source].frame_indices[first], most, rng)
+                chosen = _randomly_at_most(tracks[source].frame_indices[first], most, rng)
                 found = _look(
                     stretches[target], tracks, source, target, truths, landmarks, first[chosen], lag, rng
                 )
@@ -72,16 +72,11 @@ def _second_apart(tracks: Tracks) -> tuple[Indices, Indices]:
     """Observations in a frame of every second, and of the same track a second later."""
     stamps = tracks.timestamps_ns
     step = max(round(_EVERY_S / max(float(np.median(np.diff(stamps))) * 1e-9, 1e-3)), 1)
-    width = int(tracks.track_ids.max(initial=0)) + 1
-    keys = tracks.frame_indices * width + tracks.track_ids
     first = np.flatnonzero(tracks.frame_indices % step == 0)
-    wanted = keys[first] + step * width
-    at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    found = keys[at] == wanted
-    return first[found], at[found]
+    return tracks.same_tracks(first, tracks.frame_indices[first] + step)
 
 
-def _at_most(group: Indices, most: int, rng: np.random.Generator) -> Indices:
+def _randomly_at_most(group: Indices, most: int, rng: np.random.Generator) -> Indices:
     """Rows, at most so many of each group, at random."""
     order = rng.permutation(len(group))
     order = order[np.argsort(group[order], kind="stable")]
