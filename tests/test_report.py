@@ -75,7 +75,7 @@ def test_everything_has_a_panel(page: str) -> None:
 
 
 def test_what_stands_behind_each_figure_is_said(page: str) -> None:
-    assert "4,000 observations" in page  # the histogram's
+    assert "2,000 observations" in page  # the histogram's
     assert "Scatter of the residuals" in page
     assert "120 values" in page  # of 60 s
     assert "120 of 360 values" in page
@@ -326,12 +326,12 @@ def test_reduction_finds_what_was_put_in(folder: Path) -> None:
         mine = arrays["camera"] == 0
         size = np.linalg.norm(arrays["residuals_px"][mine], axis=1)
         pixels = arrays["pixels"][mine]
-    assert front.count == 4000
+    assert front.count == 2000
     assert front.median_px == pytest.approx(float(np.median(size)))
-    assert front.image.counts.sum() == 4000
+    assert front.image.counts.sum() == 2000
     cell = (pixels[:, 0] + 0.5 < 640 / 24) & (pixels[:, 1] + 0.5 < 480 / 18)
     assert front.image.counts[0, 0] == cell.sum()
-    assert front.over_angle.counts.sum() <= 4000
+    assert front.over_angle.counts.sum() <= 2000
     assert content.tracks["port"].report["frames_black"] == 1
 
 
