@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from math import hypot, isfinite
 
-import numpy as np
 from numba.extending import register_jitable
 
 from rigwake._types import Array
