@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,12 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     from work_units import FileScheduling
 
     return FileScheduling(config, log)
+
+
+def pytest_collection_finish() -> None:
+    """Three thousand tests and all libraries stay to the end: no collection of garbage need look at them again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -70,7 +70,7 @@ def write_folder(
     folder: Path,
     calibration: Calibration | None = None,
     duration_s: float = 60.0,
-    observations: int = 4000,
+    observations: int = 2000,
     pictures_per_camera: int = 1,
     seed: int = 0,
 ) -> Path:
@@ -82,11 +82,11 @@ def write_folder(
     rough = {n: replace(c, rig_from_cam=c.rig_from_cam.retract(rng.normal(0, 0.05, 6)))
              for n, c in calibration.cameras.items()}  # fmt: skip
     save_calibration(replace(calibration, cameras=rough), folder / "initial_rig.yaml")
-    rig = circle(duration_s)
+    rig = circle(duration_s, 8.0)
     write_tum(rig, folder / "trajectories" / "rig.tum")
     for name, one in calibration.cameras.items():
         finite = SE3(np.nan_to_num(one.rig_from_cam.rotation), np.nan_to_num(one.rig_from_cam.translation))
-        path = Trajectory(name, rig.timestamps_ns[::4], rig.world_from_body[::4] * finite)
+        path = Trajectory(name, rig.timestamps_ns[::2], rig.world_from_body[::2] * finite)
         write_tum(path, folder / "trajectories" / f"{name}.tum")
         write_tracks(folder / "tracks" / f"{name}.npz", name, rig.timestamps_ns, observations, rng)
     write_residuals(folder / "residuals.npz", list(calibration.cameras), rig, observations, rng)
@@ -139,7 +139,7 @@ def write_adjustment(
     path: Path, names: list[str], rig: Trajectory, rng: np.random.Generator, landmarks: int = 600
 ) -> None:
     """Sensors over time and a ring of landmarks on shore; one lies very far away."""
-    stamps = rig.timestamps_ns[::10]
+    stamps = rig.timestamps_ns[::4]
     n, around = len(stamps), rng.uniform(0, 2 * np.pi, landmarks)
     shore = np.stack([45 * np.cos(around), 45 * np.sin(around), rng.uniform(0, 8, landmarks)], axis=1)
     shore[0] = 1e6

@@ -92,7 +92,7 @@ USED = [
         "",
     ),
     ("undistort {mask} --camera-file {lens} --out {here}/u2", 0, "files in"),
-    ("undistort {mask} --camera-file {lens} --camera front --output {here}/u3", 0, "files in"),
+    ("undistort {mask} --camera-file {lens} --camera front --focal 40 --output {here}/u3", 0, "files in"),
     (
         "handeye {rig_tum} {port_tum} -o {here}/h9.yaml --frame enu --columns _",
         (0, 1, 2),

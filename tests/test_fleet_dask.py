@@ -10,6 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -22,8 +23,12 @@ from rigwake.fleet.fleet_run import FleetPlan, run_fleet
 from rigwake.fleet.resume import read_outcome
 from test_fleet_pool import begun, jobs_named
 
-distributed = pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
-pytestmark = [pytest.mark.xdist_group("fleet"), pytest.mark.filterwarnings("default")]
+pytestmark = [
+    pytest.mark.xdist_group("fleet"),
+    pytest.mark.filterwarnings("default"),
+    # every worker collects this file: importing takes its time
+    pytest.mark.skipif(find_spec("distributed") is None, reason="the extra `fleet` is not installed"),
+]
 
 
 @pytest.fixture(scope="module")

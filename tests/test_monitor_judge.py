@@ -114,14 +114,14 @@ def test_an_imu_that_turned_is_blamed_on_no_camera(quiet: Watch, quiet_scores: B
 
 
 def test_a_slow_ramp_is_called_one(quiet: Watch, quiet_scores: BlockScores) -> None:
-    """0.3 deg per hour over half an hour: normal matrices as measured, scores drawn from what they predict."""
-    rng = np.random.default_rng(2)
-    picked = rng.integers(1, len(quiet_scores), 180)
+    """0.6 deg per hour over a quarter: normal matrices as measured, scores drawn from what they predict."""
+    rng, deg_per_hour, blocks = np.random.default_rng(2), 0.6, 90
+    picked = rng.integers(1, len(quiet_scores), blocks)
     scores = quiet_scores.take(picked)
-    scores = replace(scores, starts_ns=quiet_scores.starts_ns[0] + np.arange(180) * 10**10)
+    scores = replace(scores, starts_ns=quiet_scores.starts_ns[0] + np.arange(blocks) * 10**10)
     g = np.empty_like(scores.g)
-    rate = np.deg2rad(0.3) / 360
-    for k in range(180):
+    rate = np.deg2rad(deg_per_hour) / 360
+    for k in range(blocks):
         values, vectors = np.linalg.eigh(scores.H[k])
         g[k] = vectors @ (np.sqrt(np.maximum(values, 0)) * rng.standard_normal(len(values)))
         step = np.zeros(7)
@@ -130,10 +130,10 @@ def test_a_slow_ramp_is_called_one(quiet: Watch, quiet_scores: BlockScores) -> N
     judgement = quiet.judge(replace(scores, g=g))
     (alarm,) = (a for a in judgement.alarms if a.camera)
     assert alarm.camera == "left"
-    assert alarm.block * 0.3 / 360 < 0.2
+    assert alarm.block * deg_per_hour / 360 < 0.2
     assert alarm.change is not None
     assert alarm.change.kind == "ramp"
-    assert abs(alarm.change.rate_deg_per_hour - 0.3) < 0.09
+    assert abs(alarm.change.rate_deg_per_hour - deg_per_hour) < 0.3 * deg_per_hour
 
 
 def test_straight_on_calm_water_is_never_ok() -> None:

@@ -70,9 +70,8 @@ def test_no_file_name_stands_in_two_packages() -> None:
 def test_no_class_name_stands_in_two_files() -> None:
     places = defaultdict(list)
     for path in MODULES:
-        for node in ast.parse(SOURCES[path]).body:
-            if isinstance(node, ast.ClassDef):
-                places[node.name].append(str(path.relative_to(PACKAGE)))
+        for name in re.findall(r"^class (\w+)", SOURCES[path], re.MULTILINE):
+            places[name].append(str(path.relative_to(PACKAGE)))
     twice = {name: found for name, found in places.items() if len(found) > 1}
     assert not twice, twice
 
@@ -90,7 +89,7 @@ def test_the_old_dialect_is_gone(word: str) -> None:
     found = [
         f"{path.relative_to(ROOT)}:{number}: {line.strip()[:80]}"
         for path, text in sorted(TEXTS.items())
-        if pattern.search(text)
+        if re.search(word, text) and pattern.search(text)  # the first is fast
         for number, line in enumerate(text.splitlines(), 1)
         if pattern.search(KEYS_OF_FILES.sub("", line))
     ]

@@ -85,3 +85,14 @@ def test_where_it_is_done_changes_nothing(stream: CameraStream, joined: Tracks) 
     for key in ("frame_indices", "track_ids", "pixels", "std_px"):
         np.testing.assert_array_equal(getattr(again, key), getattr(joined, key))
     assert done == [22, 42]
+
+
+def test_a_track_is_looked_up_in_another_frame(joined: Tracks) -> None:
+    rows = np.flatnonzero(joined.frame_indices % 5 == 0)
+    kept, later = joined.same_tracks(rows, joined.frame_indices[rows] + 3)
+    np.testing.assert_array_equal(joined.track_ids[kept], joined.track_ids[later])
+    np.testing.assert_array_equal(joined.frame_indices[kept] + 3, joined.frame_indices[later])
+    known = set(zip(joined.frame_indices.tolist(), joined.track_ids.tolist(), strict=True))
+    wanted = zip((joined.frame_indices[rows] + 3).tolist(), joined.track_ids[rows].tolist(), strict=True)
+    assert 0 < len(kept) == sum(pair in known for pair in wanted) < len(rows)
+    assert not len(joined.take([]).same_tracks(rows[:0], rows[:0])[0])

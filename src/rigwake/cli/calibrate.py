@@ -20,10 +20,12 @@ from rigwake.cli.console import (
 from rigwake.cli.options import (
     AllowPartialOption,
     CameraFileOption,
+    CamerasOption,
     FovOption,
     HorizonOption,
     JsonOption,
     RepairOption,
+    SettingOption,
     TopicOption,
     TopicsOption,
     fields_of_view,
@@ -70,7 +72,7 @@ def command(
     reference: Annotated[
         str | None, typer.Option(help="Frame to report in: imu, base_link or a camera's name.")
     ] = None,
-    cameras: Annotated[str | None, typer.Option(help="Only these cameras, separated by commas.")] = None,
+    cameras: CamerasOption = None,
     start: Annotated[float | None, typer.Option(help="Skip so many seconds.")] = None,
     duration: Annotated[float | None, typer.Option(help="Use so many seconds.")] = None,
     precision: Annotated[
@@ -104,9 +106,7 @@ def command(
     jobs: Annotated[int | None, typer.Option(help="Processes (default: one per core).")] = None,
     seed: Annotated[int | None, typer.Option(help="Random seed.")] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file of settings.")] = None,
-    assignments: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting: adjustment.cross_camera=false.")
-    ] = None,
+    assignments: SettingOption = None,
     scheduler: Annotated[
         str,
         typer.Option(help="Dask cluster for the camera stage: tcp://HOST:PORT, or local:N (extra `fleet`)."),

@@ -10,7 +10,14 @@ import typer
 from rich.markup import escape
 
 from rigwake.cli.console import next_step, out, progress_bar, write_json
-from rigwake.cli.options import CameraFileOption, JsonOption, TopicOption, TopicsOption, require
+from rigwake.cli.options import (
+    CameraFileOption,
+    CamerasOption,
+    JsonOption,
+    TopicOption,
+    TopicsOption,
+    require,
+)
 from rigwake.errors import UsageError
 
 if TYPE_CHECKING:
@@ -36,7 +43,7 @@ def command(
         str,
         typer.Option(help="copy (stored JPEG and PNG as they are, others as JPEG), jpeg, png or raw."),
     ] = "copy",
-    cameras: Annotated[str | None, typer.Option(help="Only these cameras, separated by commas.")] = None,
+    cameras: CamerasOption = None,
     start: Annotated[float, typer.Option(help="Skip so many seconds.")] = 0.0,
     duration: Annotated[float | None, typer.Option(help="Take so many seconds.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Of each camera only every so many-th frame.")] = 1,

@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 
 from rigwake.cli.console import figures_table, next_step, out, print_title, write_json
-from rigwake.cli.options import JsonOption, require_number, require_there, require_writable
+from rigwake.cli.options import HtmlOption, JsonOption, require_number, require_there, require_writable
 
 if TYPE_CHECKING:
     from rigwake.evaluation.rig_errors import CameraDifference
@@ -27,7 +27,7 @@ def command(
         list[float] | None, typer.Option("--range", help="Ranges in metres at which pixels are compared.")
     ] = None,
     json_file: JsonOption = None,
-    html: Annotated[Path | None, typer.Option(help="Write one HTML page with plots.")] = None,
+    html: HtmlOption = None,
 ) -> None:
     """How far two calibrations are apart: has a camera been knocked, do two recordings agree?
 

@@ -23,6 +23,7 @@ from rigwake.cli.console import out, progress_bar, write_json
 from rigwake.cli.options import (
     AllowPartialOption,
     JsonOption,
+    SettingOption,
     TopicOption,
     TopicsOption,
     require_number,
@@ -102,9 +103,7 @@ def _with_fleet_choices(verb: Callable[..., None]) -> Callable[..., None]:
 def calibrate(
     choices: FleetChoices,
     config: Annotated[Path | None, typer.Option(help="YAML file of settings, as for `calibrate`.")] = None,
-    assignments: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting: adjustment.cross_camera=false.")
-    ] = None,
+    assignments: SettingOption = None,
 ) -> None:
     """Calibrate many recordings, each once. A second run does only what is new or changed.
 

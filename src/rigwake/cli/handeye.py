@@ -11,7 +11,14 @@ import typer
 from rich.markup import escape
 
 from rigwake.cli.console import err, figures_table, next_step, out, print_looks, print_title, write_json
-from rigwake.cli.options import JsonOption, completed_from, require, require_there, require_writable
+from rigwake.cli.options import (
+    HtmlOption,
+    JsonOption,
+    completed_from,
+    require,
+    require_there,
+    require_writable,
+)
 from rigwake.errors import UnobservableError
 
 if TYPE_CHECKING:
@@ -31,7 +38,7 @@ def command(
         Path | None, typer.Option("-o", "--out", "--output", help="Write calibration.yaml here.")
     ] = None,
     json_file: JsonOption = None,
-    html: Annotated[Path | None, typer.Option(help="Write one HTML page with plots.")] = None,
+    html: HtmlOption = None,
     method: Annotated[
         str,
         typer.Option(

@@ -13,6 +13,7 @@ from rigwake.atomic import write_text_atomic
 from rigwake.cli.console import figures_table, next_step, out, progress_bar, write_json
 from rigwake.cli.options import (
     CameraFileOption,
+    HtmlOption,
     JsonOption,
     TopicOption,
     TopicsOption,
@@ -40,7 +41,7 @@ def command(
     topics: TopicsOption = None,
     camera_file: CameraFileOption = None,
     json_file: JsonOption = None,
-    html: Annotated[Path | None, typer.Option(help="Write one HTML page with plots.")] = None,
+    html: HtmlOption = None,
 ) -> None:
     """Sensors, rates, gaps, clocks and motion of a recording: is it enough to calibrate?
 

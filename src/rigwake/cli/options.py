@@ -70,6 +70,11 @@ FovOption = Annotated[
     ),
 ]
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Write the result as JSON ('-': print).")]
+HtmlOption = Annotated[Path | None, typer.Option(help="Write one HTML page with plots.")]
+CamerasOption = Annotated[str | None, typer.Option(help="Only these cameras, separated by commas.")]
+SettingOption = Annotated[
+    list[str] | None, typer.Option("--set", help="One setting: adjustment.cross_camera=false.")
+]
 RepairOption = Annotated[
     bool,
     typer.Option("--repair/--no-repair", help="Correct units, leave out samples that cannot be right."),

@@ -30,22 +30,32 @@ def _vee(matrices: Array) -> Array:
     return np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
 
 
-def _coefficients(angle: Array) -> tuple[Array, Array, Array]:
-    """`sin(t)/t`, `(1 - cos t)/t^2`, `(t - sin t)/t^3`, accurate through t = 0."""
-    small = angle < _SMALL
+def _sine(angle: Array) -> Array:
+    """`sin(t)/t`, accurate through t = 0."""
+    small, t2 = angle < _SMALL, angle * angle
     t = np.where(small, 1.0, angle)
-    t2 = angle * angle
-    a = np.where(small, 1 - t2 / 6 + t2 * t2 / 120, np.sin(t) / t)
-    b = np.where(small, 0.5 - t2 / 24 + t2 * t2 / 720, 2 * np.sin(t / 2) ** 2 / t**2)
-    c = np.where(small, 1 / 6 - t2 / 120 + t2 * t2 / 5040, (t - np.sin(t)) / t**3)
-    return a, b, c
+    return np.where(small, 1 - t2 / 6 + t2 * t2 / 120, np.sin(t) / t)
+
+
+def _cosine(angle: Array) -> Array:
+    """`(1 - cos t)/t^2`, accurate through t = 0."""
+    small, t2 = angle < _SMALL, angle * angle
+    t = np.where(small, 1.0, angle)
+    return np.where(small, 0.5 - t2 / 24 + t2 * t2 / 720, 2 * np.sin(t / 2) ** 2 / t**2)
+
+
+def _sine_rest(angle: Array) -> Array:
+    """`(t - sin t)/t^3`, accurate through t = 0."""
+    small, t2 = angle < _SMALL, angle * angle
+    t = np.where(small, 1.0, angle)
+    return np.where(small, 1 / 6 - t2 / 120 + t2 * t2 / 5040, (t - np.sin(t)) / t**3)
 
 
 def exp(rotation_vectors: ArrayLike) -> Array:
     """Rotation matrices of rotation vectors (Rodrigues): (..., 3) -> (..., 3, 3)."""
     v = np.asarray(rotation_vectors, dtype=np.float64)
-    a, b, _ = _coefficients(np.linalg.norm(v, axis=-1))
-    K = hat(v)
+    angle = np.linalg.norm(v, axis=-1)
+    a, b, K = _sine(angle), _cosine(angle), hat(v)
     return np.asarray(np.eye(3) + a[..., None, None] * K + b[..., None, None] * (K @ K))
 
 
@@ -68,8 +78,8 @@ def log(rotations: ArrayLike) -> Array:
 def right_jacobian(rotation_vectors: ArrayLike) -> Array:
     """`J_r` with `exp(v + d) ~ exp(v) exp(J_r d)`: (..., 3) -> (..., 3, 3)."""
     v = np.asarray(rotation_vectors, dtype=np.float64)
-    _, b, c = _coefficients(np.linalg.norm(v, axis=-1))
-    K = hat(v)
+    angle = np.linalg.norm(v, axis=-1)
+    b, c, K = _cosine(angle), _sine_rest(angle), hat(v)
     return np.asarray(np.eye(3) - b[..., None, None] * K + c[..., None, None] * (K @ K))
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from math import hypot, isfinite
 
-import numpy as np
 from numba.extending import register_jitable
 
 from rigwake._types import Array
@@ -107,4 +106,4 @@ def undistort(xd: float, yd: float, d: Array, max_radius: float) -> tuple[float,
 
 def radial_slope(d: Array, radius: Array) -> Array:
     """Derivative of the distorted radius at radii (N,), as `radial_curve` gives it."""
-    return np.array([radial_curve(d, float(r))[1] for r in radius])
+    return radial_curve(d, radius)[1]
