@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from rigwake.api import FUNCTIONS
-from rigwake.kernel_cache import provide_kernel_cache
+from rigwake.kernel_cache import provide_kernel_cache, speed_up_compilation
 
 if TYPE_CHECKING:
     from rigwake.api import *  # noqa: F403
@@ -28,6 +28,7 @@ _VALUES = {"Calibration": "calibration", "Recording": "recording", "Trajectory":
 __all__ = ["__version__", *_VALUES, *FUNCTIONS]
 _ALSO_PACKAGES = ("handeye", "intrinsics", "monitor", "odometry", "report")
 
+speed_up_compilation()
 provide_kernel_cache()  # before any module with compiled loops is imported
 
 

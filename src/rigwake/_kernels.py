@@ -12,7 +12,7 @@ from uuid import uuid4
 import numba
 from numba.core.caching import IndexDataCacheFile
 
-__all__ = ["KernelFile", "njit"]
+__all__ = ["KernelFile", "inlined", "njit"]
 
 
 class KernelFile(IndexDataCacheFile):
@@ -62,3 +62,12 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         return kernel
 
     return compiled
+
+
+# For what compiled loops call. Inlined by LLVM: numba's own inlining (`inline="always"`) infers the types of the same
+# lines again at every level, which takes five times as long. A function that is not inlined would have two copies, one
+# of them optimised again inside its caller, and which one runs would differ between the process that compiles and those
+# that load, by a rounding of sums. Pixels may be NaN: `nnan` is left out
+inlined = njit(
+    nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy", forceinline=True
+)

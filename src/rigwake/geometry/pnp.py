@@ -26,7 +26,7 @@ class AbsolutePose:
     inliers: Mask
 
 
-@njit()
+@njit(error_model="numpy")
 def _bearing_angles(R: Array, c: Array, points: Array, bearings: Array) -> Array:
     """Angles between bearings and the directions to points; R, c: world_from_cam."""
     out = np.empty(len(points))
@@ -53,7 +53,7 @@ def bearing_angles(world_from_cam: SE3, points_world: Array, bearings_cam: Array
     )
 
 
-@njit()
+@njit(error_model="numpy")
 def _tangents(b: Array, e: Array) -> None:
     """Writes two unit vectors normal to b and to each other into e (2, 3) (Duff et al., JCGT 2017)."""
     sign = 1.0 if b[2] >= 0 else -1.0
@@ -63,7 +63,7 @@ def _tangents(b: Array, e: Array) -> None:
     e[1, 0], e[1, 1], e[1, 2] = q, sign + b[1] * b[1] * p, -b[1]
 
 
-@njit()
+@njit(error_model="numpy")
 def _normal_equations(
     R: Array, c: Array, points: Array, bearings: Array, stds: Array, scale: float
 ) -> tuple[Array, Array, float]:
@@ -108,10 +108,10 @@ def _normal_equations(
     return H, g, cost
 
 
-@njit()
+@njit(error_model="numpy")
 def _moved(R: Array, c: Array, step: Array) -> tuple[Array, Array]:
-    """`SE3(R, c).retract(step)`, without the cost of many small arrays."""
-    w = step[:3]
+    """`SE3(R, c).retract(step)`, in loops: products of small arrays take long to compile."""
+    w = step
     squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     if squared < 1e-8:
         a, b, d = 1 - squared / 6, 0.5 - squared / 24, 1 / 6 - squared / 120
@@ -119,13 +119,48 @@ def _moved(R: Array, c: Array, step: Array) -> tuple[Array, Array]:
         angle = np.sqrt(squared)
         a = np.sin(angle) / angle
         b, d = 2 * np.sin(angle / 2) ** 2 / squared, (1 - a) / squared
-    K = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
-    square = K @ K
-    turn, along = np.eye(3) + a * K + b * square, np.eye(3) + b * K + d * square
-    return R @ turn, c + R @ (along @ step[3:])
+    turn, new_R, new_c, v = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    for i in range(3):
+        v[i] = 0.0
+        for j in range(3):
+            # of the cross product's matrix, and of its square
+            hat = 0.0 if i == j else (w[3 - i - j] if (i - j) % 3 == 1 else -w[3 - i - j])
+            square, unit = w[i] * w[j], 0.0
+            if i == j:
+                square, unit = square - squared, 1.0
+            turn[i, j] = unit + a * hat + b * square
+            v[i] += (unit + b * hat + d * square) * step[3 + j]
+    for i in range(3):
+        new_c[i] = c[i] + R[i, 0] * v[0] + R[i, 1] * v[1] + R[i, 2] * v[2]
+        for j in range(3):
+            new_R[i, j] = R[i, 0] * turn[0, j] + R[i, 1] * turn[1, j] + R[i, 2] * turn[2, j]
+    return new_R, new_c
 
 
-@njit()
+@njit(error_model="numpy")
+def _damped_step(H: Array, g: Array, damping: float) -> Array:
+    """`-(H + damping diag(H))^-1 g` by L D L^T."""
+    n = len(g)
+    L, step = H.copy(), np.empty(n)
+    for i in range(n):
+        L[i, i] += damping * (H[i, i] + 1e-12)
+        step[i] = -g[i]
+        for j in range(i + 1):
+            total = L[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k] * L[k, k]
+            if i > j:
+                total /= L[j, j]
+                step[i] -= total * step[j]
+            L[i, j] = total
+    for i in range(n - 1, -1, -1):
+        step[i] /= L[i, i]
+        for k in range(i + 1, n):
+            step[i] -= L[k, i] * step[k]
+    return step
+
+
+@njit(error_model="numpy")
 def _minimise(
     R: Array, c: Array, points: Array, bearings: Array, stds: Array, scale: float, iterations: int
 ) -> tuple[Array, Array, Array]:
@@ -133,7 +168,7 @@ def _minimise(
     H, g, cost = _normal_equations(R, c, points, bearings, stds, scale)
     damping = 1e-6
     for _ in range(iterations):
-        step = -np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-12), g)
+        step = _damped_step(H, g, damping)
         new_R, new_c = _moved(R, c, step)
         new_H, new_g, new_cost = _normal_equations(new_R, new_c, points, bearings, stds, scale)
         if new_cost <= cost:

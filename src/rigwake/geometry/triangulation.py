@@ -48,7 +48,7 @@ def triangulate_midpoint(second_from_first: SE3, bearings_first: Array, bearings
     ).points
 
 
-@njit()
+@njit(error_model="numpy")
 def _nearest_point(origins: Array, directions: Array, weights: Array, lo: int, hi: int) -> tuple[Array, bool]:
     """Minimises the weighted squared distances to the rays lo..hi."""
     A = np.zeros((3, 3))
@@ -84,20 +84,20 @@ def _nearest_point(origins: Array, directions: Array, weights: Array, lo: int, h
     return x, True
 
 
-@njit()
+@njit(error_model="numpy")
 def _direction(x: Array, origin: Array, out: Array) -> None:
     d0, d1, d2 = x[0] - origin[0], x[1] - origin[1], x[2] - origin[2]
     norm = max(np.sqrt(d0 * d0 + d1 * d1 + d2 * d2), 1e-18)
     out[0], out[1], out[2] = d0 / norm, d1 / norm, d2 / norm
 
 
-@njit()
+@njit(error_model="numpy")
 def _angle(a: Array, b: Array) -> float:
     x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
     return float(np.arctan2(np.sqrt(x * x + y * y + z * z), a[0] * b[0] + a[1] * b[1] + a[2] * b[2]))
 
 
-@njit()
+@njit(error_model="numpy")
 def _triangulate(
     origins: Array, directions: Array, starts: Indices, rounds: int
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
@@ -123,7 +123,7 @@ def _triangulate(
             x, fixed = _nearest_point(origins, directions, weights, lo, hi)
         if not fixed:
             continue
-        points[p] = x
+        points[p, 0], points[p, 1], points[p, 2] = x[0], x[1], x[2]
         _direction(x, origins[lo], first)
         squares, all_ahead = 0.0, True
         for k in range(lo, hi):

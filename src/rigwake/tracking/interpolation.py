@@ -12,10 +12,9 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from rigwake._kernels import njit
+from rigwake._kernels import inlined, njit
 from rigwake._types import Image
 
 Coefficients = NDArray[np.float32]
@@ -70,7 +69,7 @@ _1, _2, _3, _4, _6 = (np.float32(value) for value in (1, 2, 3, 4, 6))
 _NEXT = np.uint32(1)
 
 
-@register_jitable(inline="always")
+@inlined
 def _weights(t):  # type: ignore[no-untyped-def]
     s = _1 - t
     return (
@@ -81,13 +80,13 @@ def _weights(t):  # type: ignore[no-untyped-def]
     )
 
 
-@register_jitable(inline="always")
+@inlined
 def _slopes(t):  # type: ignore[no-untyped-def]
     s = _1 - t
     return -s * s / _2, (_3 * t * t - _4 * t) / _2, (_4 * s - _3 * s * s) / _2, t * t / _2
 
 
-@register_jitable(inline="always")
+@inlined
 def _along(c, row, column, w):  # type: ignore[no-untyped-def]
     i0 = column - _NEXT
     i2 = column + _NEXT
@@ -95,7 +94,7 @@ def _along(c, row, column, w):  # type: ignore[no-untyped-def]
     return w[0] * c[row, i0] + w[1] * c[row, column] + w[2] * c[row, i2] + w[3] * c[row, i3]
 
 
-@register_jitable(inline="always")
+@inlined
 def sample(coefficients: Coefficients, x: float, y: float) -> float:
     """Grey level at (x, y); 1 <= x < W - 2 and 1 <= y < H - 2 is the caller's duty."""
     column, row = np.uint32(x), np.uint32(y)
@@ -107,7 +106,7 @@ def sample(coefficients: Coefficients, x: float, y: float) -> float:
     return b[0] * v0 + b[1] * v1 + b[2] * v2 + b[3] * v3
 
 
-@register_jitable
+@inlined
 def sample_with_gradient(coefficients: Coefficients, x: float, y: float) -> tuple[float, float, float]:
     """Grey level at (x, y) and its derivatives by x and y; same duty as for `sample`."""
     column, row = np.uint32(x), np.uint32(y)

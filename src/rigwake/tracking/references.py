@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from rigwake._kernels import njit
+from rigwake._kernels import inlined, njit
 from rigwake._tables import join_rows, take_rows
 from rigwake._types import Array, Floats, Mask
 from rigwake.tracking.interpolation import Coefficients, sample_with_gradient
@@ -90,8 +89,15 @@ class References:
 
 def make_references(coefficients: Coefficients, pixels: Array, shape: PatchShape) -> tuple[References, Mask]:
     """Reference patches about pixels (N, 2), and which of them (N,) lie inside the image and have texture."""
-    made = _make_references(coefficients, pixels, shape.offsets, shape.root_weights)
-    return References(*made[:4]), made[4]
+    n, n_samples = len(pixels), len(shape.offsets)
+    pattern, information = np.zeros((n, ROWS, n_samples), np.float32), np.zeros((n, UNKNOWNS, UNKNOWNS))
+    made = References(pattern, information, np.zeros(n), np.zeros((n, 2, 6)))
+    good, samples = np.zeros(n, np.bool_), np.zeros((UNKNOWNS + PHOTOMETRIC + 6, n_samples))
+    _make_references(
+        coefficients, pixels, shape.offsets, shape.root_weights, samples, np.zeros((UNKNOWNS + 1, UNKNOWNS)),
+        made.pattern, made.information, made.contrast, made.bias_responses, good,
+    )  # fmt: skip
+    return made, good
 
 
 def registration_bias(references: References, warps: Array, second_order: Array) -> Array:
@@ -106,19 +112,16 @@ def registration_bias(references: References, warps: Array, second_order: Array)
     return np.asarray((warps @ references.bias_responses @ in_patch)[:, :, 0])
 
 
-@njit(nogil=True)
-def _make_references(
-    coefficients: Coefficients, pixels: Array, offsets: Floats, root_weights: Floats
-) -> tuple[Floats, Array, Array, Array, Mask]:
+@njit(nogil=True, error_model="numpy")
+def _make_references(  # type: ignore[no-untyped-def]
+    coefficients, pixels, offsets, root_weights, samples, equations, pattern, information, contrast, bias_responses,
+    good,
+):  # fmt: skip
+    """Fills the arrays from `pattern` on, which are zero; `samples` and `equations` are room to work in."""
     n_patches, n_samples = len(pixels), len(offsets)
     height, width = coefficients.shape
-    pattern = np.zeros((n_patches, ROWS, n_samples), np.float32)
-    information = np.zeros((n_patches, UNKNOWNS, UNKNOWNS))
-    contrast = np.zeros(n_patches)
-    bias_responses = np.zeros((n_patches, 2, 6))
-    good = np.zeros(n_patches, np.bool_)
-    slopes, basis = np.zeros((UNKNOWNS, n_samples)), np.zeros((PHOTOMETRIC, n_samples))
-    bent, factor, answer = np.zeros((6, n_samples)), np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    slopes, basis = samples[:UNKNOWNS], samples[UNKNOWNS : UNKNOWNS + PHOTOMETRIC]
+    bent, factor, answer = samples[UNKNOWNS + PHOTOMETRIC :], equations[:UNKNOWNS], equations[UNKNOWNS]
     reach = offsets[-1, 1]  # the last sample is the lowest one of a disc
     for n in range(n_patches):
         px, py = pixels[n, 0], pixels[n, 1]
@@ -147,10 +150,9 @@ def _make_references(
         for k in range(n_samples):
             for i in range(ROWS):
                 pattern[n, i, k] = slopes[i, k] if i < UNKNOWNS else basis[i - UNKNOWNS, k]
-    return pattern, information, contrast, bias_responses, good
 
 
-@register_jitable
+@inlined
 def _second_order_slopes(slopes: Array, offsets: Floats, bent: Array) -> None:
     """Into `bent` (6, K): the samples' derivatives by second derivatives of x and of y by xx, xy and yy."""
     for k in range(len(offsets)):
@@ -161,7 +163,7 @@ def _second_order_slopes(slopes: Array, offsets: Floats, bent: Array) -> None:
             bent[3 * i + 2, k] = slopes[i, k] * y * y / 2
 
 
-@register_jitable
+@inlined
 def _bias_response(
     information: Array, slopes: Array, bent: Array, factor: Array, answer: Array, bias_response: Array
 ) -> None:
@@ -179,7 +181,7 @@ def _bias_response(
             bias_response[0, c], bias_response[1, c] = answer[0], answer[1]
 
 
-@register_jitable
+@inlined
 def _orthonormalise(basis: Array) -> float:
     """Gram-Schmidt in place; the norm of the last row before it was scaled, 0 if any row depends on others."""
     norm = 0.0
@@ -197,7 +199,7 @@ def _orthonormalise(basis: Array) -> float:
 
 
 # as loops: operations on whole arrays take numba ten times as long to compile
-@register_jitable
+@inlined
 def _dot(a: Array, b: Array) -> float:
     total = 0.0
     for k in range(len(a)):
@@ -205,7 +207,7 @@ def _dot(a: Array, b: Array) -> float:
     return total
 
 
-@register_jitable
+@inlined
 def _project_out(a: Array, unit: Array) -> None:
     """Take the part along a unit vector off, in place."""
     along = _dot(a, unit)

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from rigwake._kernels import njit
+from rigwake._kernels import inlined, njit
 from rigwake._types import Array, Floats, Mask
 from rigwake.parallel import over_ranges, ranges
 from rigwake.tracking.interpolation import Coefficients, sample
@@ -105,8 +104,8 @@ def _noise_bandwidth(lag_sums: Array) -> float:
     return float(np.prod((1 + rho) / (1 - rho)))
 
 
-# what it calls is inlined for the reason given in `klt.py`
-@njit(nogil=True, fastmath=SUMS_IN_ANY_ORDER)
+# what it calls is inlined for the reason given in `_kernels.py`
+@njit(nogil=True, fastmath=SUMS_IN_ANY_ORDER, error_model="numpy")
 def _register(  # type: ignore[no-untyped-def]
     first, last, coefficients, pattern, information, contrast, offsets, root_weights, lower_right, lower_left,
     warp_precision, noise_variance, max_shift_px, iterations, pixels, warps, found, correlation, variance, spread,
@@ -144,7 +143,7 @@ def _register(  # type: ignore[no-untyped-def]
         found[n] = found[n] and spread[n] > 0
 
 
-@register_jitable(inline="always")
+@inlined
 def _correlate(
     coefficients: Coefficients,
     pattern: Floats,
@@ -182,7 +181,7 @@ def _correlate(
     return max(float(power), 0.0)
 
 
-@register_jitable(inline="always")
+@inlined
 def _normal_equations(
     gain: float, information: Array, sums: Floats, weight: float, strayed: Entries, matrix: Array, step: Array
 ) -> None:
@@ -196,19 +195,19 @@ def _normal_equations(
         step[2 + i] += weight * (strayed[i] - (1.0 if i in (0, 3) else 0.0))
 
 
-@register_jitable(inline="always")
+@inlined
 def _entries(a: Array) -> Entries:
     """Of a 2x2 matrix, row by row: as numbers, not arrays, small products compile and run sooner."""
     return a[0, 0], a[0, 1], a[1, 0], a[1, 1]
 
 
-@register_jitable(inline="always")
+@inlined
 def _inverse(a: Entries) -> Entries:
     determinant = a[0] * a[3] - a[1] * a[2]
     return a[3] / determinant, -a[1] / determinant, -a[2] / determinant, a[0] / determinant
 
 
-@register_jitable(inline="always")
+@inlined
 def _product(a: Entries, b: Entries) -> Entries:
     return (
         a[0] * b[0] + a[1] * b[2],
@@ -218,7 +217,7 @@ def _product(a: Entries, b: Entries) -> Entries:
     )
 
 
-@register_jitable(inline="always")
+@inlined
 def _step(matrix: Array, step: Array, pixel: Array, warp: Array) -> float:
     """Solve for the template's increment and compose its inverse with the warp (in place); pixels moved,
     negative if it cannot be done. `matrix` is left as its Cholesky factor."""
@@ -236,7 +235,7 @@ def _step(matrix: Array, step: Array, pixel: Array, warp: Array) -> float:
     return sqrt(dx * dx + dy * dy)
 
 
-@register_jitable(inline="always")
+@inlined
 def _neighbour_products(
     values: Floats,
     pattern: Floats,

@@ -5,12 +5,12 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numba.extending import register_jitable
 
+from rigwake._kernels import inlined
 from rigwake._types import Array
 
 
-@register_jitable(inline="always")
+@inlined
 def cholesky_solve(matrix: Array, right_side: Array) -> bool:
     """Solve in place by L L^T, leaving L in the lower half; False if not positive definite."""
     n = len(right_side)
@@ -35,7 +35,7 @@ def cholesky_solve(matrix: Array, right_side: Array) -> bool:
     return True
 
 
-@register_jitable(inline="always")
+@inlined
 def position_spread(factor: Array) -> float:
     """Mean of the first two diagonal entries of `(L L^T)^-1`."""
     total = 0.0

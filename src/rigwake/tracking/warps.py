@@ -20,6 +20,7 @@ from rigwake.tracking.picture_scale import ScaledRays
 _STENCIL_PX = 2.0
 _STENCIL = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [0, 0]]) * _STENCIL_PX
 _ROUNDS = 5
+_MOST_SWEEPS = 12  # Jacobi's method needs about five
 _MIN_ANGLE = 1e-4  # scale of the robust loss: about a fiftieth of a pixel of a wide lens
 
 
@@ -35,16 +36,14 @@ def dominant_rotation(bearings_before: Array, bearings_after: Array) -> Array:
 
 @njit(nogil=True)
 def _kabsch(before: Array, after: Array) -> Array:
-    weights, error, rotation = np.ones(len(before)), np.empty(len(before)), np.eye(3)
+    weights, error, rotation = np.ones(len(before)), np.empty(len(before)), np.zeros((3, 3))
     for _ in range(_ROUNDS):
         moment = np.zeros((3, 3))
         for n in range(len(before)):
             for i in range(3):
                 for j in range(3):
                     moment[i, j] += weights[n] * after[n, i] * before[n, j]
-        u, _, vt = np.linalg.svd(moment)
-        u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)
-        rotation = u @ vt
+        _nearest_rotation(moment, rotation)
         for n in range(len(before)):
             squared = 0.0
             for i in range(3):
@@ -59,6 +58,70 @@ def _kabsch(before: Array, after: Array) -> Array:
         for n in range(len(before)):
             weights[n] = 1.0 / (1.0 + (error[n] / scale) ** 2)
     return rotation
+
+
+# in loops: what numba has for singular values takes ten seconds to compile
+@njit(nogil=True, error_model="numpy")
+def _nearest_rotation(moment: Array, rotation: Array) -> None:
+    """Into `rotation` (3, 3) the R with the largest trace of `R^T moment`: the quaternion that is the eigenvector with
+    the largest eigenvalue of a symmetric matrix (Horn 1987), by Jacobi's rotations."""
+    m, q, s = np.zeros((4, 4)), np.zeros((4, 4)), moment
+    m[0, 0] = s[0, 0] + s[1, 1] + s[2, 2]
+    m[1, 1], m[2, 2] = s[0, 0] - s[1, 1] - s[2, 2], s[1, 1] - s[0, 0] - s[2, 2]
+    m[3, 3] = s[2, 2] - s[0, 0] - s[1, 1]
+    m[0, 1], m[0, 2], m[0, 3] = s[2, 1] - s[1, 2], s[0, 2] - s[2, 0], s[1, 0] - s[0, 1]
+    m[1, 2], m[1, 3], m[2, 3] = s[0, 1] + s[1, 0], s[0, 2] + s[2, 0], s[1, 2] + s[2, 1]
+    for i in range(4):
+        q[i, i] = 1.0
+        for j in range(i):
+            m[i, j] = m[j, i]
+    for _ in range(_MOST_SWEEPS):
+        rest = 0.0
+        for i in range(4):
+            for j in range(i):
+                rest += m[i, j] * m[i, j]
+                _annul(m, q, i, j)
+        if rest <= 1e-32 * (m[0, 0] ** 2 + m[1, 1] ** 2 + m[2, 2] ** 2 + m[3, 3] ** 2):
+            break
+    best = 0
+    for i in range(1, 4):
+        if m[i, i] > m[best, best]:
+            best = i
+    w, x, y, z = q[0, best], q[1, best], q[2, best], q[3, best]
+    rotation[0, 0], rotation[0, 1], rotation[0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+    )
+    rotation[1, 0], rotation[1, 1], rotation[1, 2] = (
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+    )
+    rotation[2, 0], rotation[2, 1], rotation[2, 2] = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
+
+
+@njit(nogil=True, error_model="numpy")
+def _annul(m: Array, vectors: Array, i: int, j: int) -> None:
+    """One rotation of Jacobi's: entry (i, j) of the symmetric `m` (4, 4) becomes zero, `vectors` turn with it."""
+    if m[i, j] == 0.0:
+        return
+    theta = (m[j, j] - m[i, i]) / (2 * m[i, j])
+    t = (1.0 if theta >= 0 else -1.0) / (abs(theta) + sqrt(theta * theta + 1))
+    c = 1 / sqrt(t * t + 1)
+    s = t * c
+    for k in range(4):
+        a, b = m[k, i], m[k, j]
+        m[k, i], m[k, j] = c * a - s * b, s * a + c * b
+    for k in range(4):
+        a, b = m[i, k], m[j, k]
+        m[i, k], m[j, k] = c * a - s * b, s * a + c * b
+        a, b = vectors[k, i], vectors[k, j]
+        vectors[k, i], vectors[k, j] = c * a - s * b, s * a + c * b
 
 
 def stencil_bearings(model: ScaledRays, pixels: Array) -> tuple[Array, Mask]:

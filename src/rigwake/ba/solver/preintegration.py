@@ -119,13 +119,14 @@ def preintegrate(problem: RigProblem, starts_s: Array, ends_s: Array, states: In
     walks, gap_s = gap_walks(imu)
     times = (imu.timestamps_ns - problem.states.timestamps_ns[0]) * 1e-9
     n = len(starts_s)
-    rotation, vectors = np.empty((n, 3, 3)), np.empty((n, 3, 3))
-    by_bias, covariance = np.empty((n, 5, 3, 3)), np.empty((n, 9, 9))
+    rotation, vectors = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3, 3))
+    by_bias, covariance = np.zeros((n, 5, 3, 3)), np.zeros((n, 9, 9))
     _integrate_all(
         times,
         np.ascontiguousarray(imu.gyro, dtype=np.float64),
         np.ascontiguousarray(imu.accel, dtype=np.float64),
         np.ascontiguousarray(starts_s),
+        np.searchsorted(times, starts_s, side="right"),
         np.ascontiguousarray(ends_s),
         biases.gyro_bias[states],
         biases.accel_bias[states],
@@ -149,14 +150,14 @@ def preintegrate(problem: RigProblem, starts_s: Array, ends_s: Array, states: In
     )
 
 
-@njit()
+@njit(error_model="numpy")
 def _matmul3(a, b, out):  # type: ignore[no-untyped-def]
     for i in range(3):
         for j in range(3):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
 
 
-@njit()
+@njit(error_model="numpy")
 def _exp3(v, out, jacobian):  # type: ignore[no-untyped-def]
     """Rotation and right Jacobian of a rotation vector."""
     angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
@@ -180,7 +181,7 @@ def _exp3(v, out, jacobian):  # type: ignore[no-untyped-def]
         jacobian[j, i] -= b * v[k]
 
 
-@njit()
+@njit(error_model="numpy")
 def _sample(times, signal, t, index, out):  # type: ignore[no-untyped-def]
     """The signal at time t, linear between samples `index` and `index + 1`, held outside them."""
     fraction = (t - times[index]) / (times[index + 1] - times[index])
@@ -189,7 +190,7 @@ def _sample(times, signal, t, index, out):  # type: ignore[no-untyped-def]
         out[i] = (1 - fraction) * signal[index, i] + fraction * signal[index + 1, i]
 
 
-@njit()
+@njit(error_model="numpy")
 def _minus_rotated_hat(R, a, out):  # type: ignore[no-untyped-def]
     """`-R hat(a)`: derivative of R a by the right tangent of R."""
     for i in range(3):
@@ -198,7 +199,7 @@ def _minus_rotated_hat(R, a, out):  # type: ignore[no-untyped-def]
         out[i, 2] = R[i, 1] * a[0] - R[i, 0] * a[1]
 
 
-@njit()
+@njit(error_model="numpy")
 def _spread(covariance, A, B, work):  # type: ignore[no-untyped-def]
     """`A covariance A^T + B` in place; A (9, 9), B (9,) diagonal."""
     for i in range(9):
@@ -216,20 +217,34 @@ def _spread(covariance, A, B, work):  # type: ignore[no-untyped-def]
         covariance[i, i] += B[i]
 
 
-@njit()
+@njit(error_model="numpy")
 def _integrate_all(  # type: ignore[no-untyped-def]
-    times, gyro, accel, starts, ends, gyro_bias, accel_bias, noise, rotation, vectors, by_bias, covariance
+    times,
+    gyro,
+    accel,
+    starts,
+    after_start,
+    ends,
+    gyro_bias,
+    accel_bias,
+    noise,
+    rotation,
+    vectors,
+    by_bias,
+    covariance,
 ):
-    """One row of the outputs per interval; `vectors` holds velocity, position and final rate."""
+    """One row of the outputs per interval: added up from identity and zeros, in place; `vectors` holds velocity,
+    position and final rate."""
     last = len(times) - 2
-    A, B, work, scratch = np.eye(9), np.zeros(9), np.empty((9, 9)), np.empty((8, 3, 3))
+    A, B, work, scratch = np.zeros((9, 9)), np.zeros(9), np.zeros((9, 9)), np.zeros((8, 3, 3))
+    for i in range(9):
+        A[i, i] = 1.0
     w0, w1, a0, a1 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for n in range(len(starts)):
         R, moved, slopes, spread = rotation[n], vectors[n], by_bias[n], covariance[n]
-        R[:], moved[:], slopes[:], spread[:] = np.eye(3), 0.0, 0.0, 0.0
         t, end = starts[n], ends[n]
         forward = end >= t
-        k = min(max(np.searchsorted(times, t, side="right") - 1, 0), last)
+        k = min(max(after_start[n] - 1, 0), last)
         if not forward and k > 0 and times[k] >= t:
             k -= 1
         _bias_free(times, gyro, t, k, gyro_bias[n], w0)
@@ -244,20 +259,22 @@ def _integrate_all(  # type: ignore[no-untyped-def]
             _advance(reached - t, w0, w1, a0, a1, R, moved, slopes, A, scratch)
             _step_noise(noise, abs(reached - t), times[k + 1] - times[k], B)
             _spread(spread, A, B, work)
-            w0[:], a0[:] = w1, a1
+            for i in range(3):
+                w0[i], a0[i] = w1[i], a1[i]
             t = reached
             k = min(max(k + (1 if forward else -1), 0), last)
-        moved[2] = w0
+        for i in range(3):
+            moved[2, i] = w0[i]
 
 
-@njit()
+@njit(error_model="numpy")
 def _bias_free(times, signal, t, index, bias, out):  # type: ignore[no-untyped-def]
     _sample(times, signal, t, index, out)
     for i in range(3):
         out[i] -= bias[i]
 
 
-@njit()
+@njit(error_model="numpy")
 def _advance(dt, w0, w1, a0, a1, R, vectors, by_bias, A, scratch):  # type: ignore[no-untyped-def]
     """One step between rates w0, w1 and accelerations a0, a1 at its ends: increments, their derivatives by the
     biases, and the transition A (9, 9) of their errors."""
@@ -284,10 +301,12 @@ def _advance(dt, w0, w1, a0, a1, R, vectors, by_bias, A, scratch):  # type: igno
         A[6 + i, 3 + i] = dt
     _move(dt, a0, a1, R, R1, vectors[0], vectors[1])
     _move_by_bias(dt, R, R1, H0, H1, Rg1, by_bias)
-    R[:], Rg[:] = R1, Rg1
+    for i in range(3):
+        for j in range(3):
+            R[i, j], Rg[i, j] = R1[i, j], Rg1[i, j]
 
 
-@njit()
+@njit(error_model="numpy")
 def _move(dt, a0, a1, R, R1, v, p):  # type: ignore[no-untyped-def]
     """Velocity and position, with a force that varies linearly."""
     for i in range(3):
@@ -297,7 +316,7 @@ def _move(dt, a0, a1, R, R1, v, p):  # type: ignore[no-untyped-def]
         v[i] += (f0 + f1) * dt / 2
 
 
-@njit()
+@njit(error_model="numpy")
 def _move_by_bias(dt, R, R1, H0, H1, Rg1, by_bias):  # type: ignore[no-untyped-def]
     """Derivatives of velocity and position by both biases."""
     Rg, Vg, Va, Pg, Pa = by_bias[0], by_bias[1], by_bias[2], by_bias[3], by_bias[4]
@@ -311,7 +330,7 @@ def _move_by_bias(dt, R, R1, H0, H1, Rg1, by_bias):  # type: ignore[no-untyped-d
             Va[i, j] -= (R[i, j] + R1[i, j]) * dt / 2
 
 
-@njit()
+@njit(error_model="numpy")
 def _step_noise(noise, size, sample_step, B):  # type: ignore[no-untyped-def]
     """B (9,): what sensor noise adds in a step of this size (s); across a gap, what the signal may have done unseen."""
     gyro_bridge, accel_bridge = 0.0, 0.0
