@@ -108,7 +108,7 @@ def scale_covariance(
 
 
 def scale_finding(reference: str, member: str, scale: RelativeScale) -> Finding | None:
-    """A warning where the scales disagree beyond doubt."""
+    """A warning where the scales disagree by five standard deviations and a per cent."""
     off = scale.value - 1
     if abs(off) < max(_TOLD, _TOLD_SIGMAS * scale.std):
         return None
