@@ -23,7 +23,9 @@ from rigwake.trajectory import Trajectory
 _STRIDES_S = (16.0, 8.0, 4.0, 2.0, 1.0)  # the longest of which there are enough
 _PARTS = 10  # of the recording: the spread of their scales is that of their median
 _FEWEST_PER_PART = 4
-_LEAST_WAY = 3.0  # lever arms: a stride that is shorter says more about the mounting than about scale
+_ROUNDS = 5
+_SINGULAR = 1e-6
+_USEFUL = 0.3  # deviation
 _TOLD_SIGMAS, _TOLD = 5.0, 0.01
 
 
@@ -43,33 +45,58 @@ class RelativeScale:
 def relative_scale(
     reference: Trajectory, member: Trajectory, ref_from_member: SE3, offset_s: float
 ) -> RelativeScale | None:
-    """From the lengths of their ways over long strides, the member's carried over to the reference by the mounting.
+    """From long strides, together with the offset that goes with it: the mounting's own has given way to the scale.
 
-    offset_s: `t_ref = t_member + offset_s`. None where they do not go far enough. The median over ten parts of the
-    recording, so that a place where one of them is lost does not count.
+    offset_s: `t_ref = t_member + offset_s`. None where the strides do not tell.
     """
     for stride_s in _STRIDES_S:
         both = strides_of_both(reference, member, offset_s, stride_s)
         if both is not None and len(both[0]) >= _PARTS * _FEWEST_PER_PART:
-            return _over_strides(*both, ref_from_member)
+            return _over_strides(*both, ref_from_member.rotation)
     return None
 
 
-def _over_strides(A: SE3, B: SE3, X: SE3) -> RelativeScale | None:
-    arm = X.translation
-    way = A.translation + A.rotation @ arm - arm  # of the member, seen from the reference
-    far = np.linalg.norm(way, axis=1) > _LEAST_WAY * np.linalg.norm(arm)
-    found = []
-    for part in np.array_split(np.flatnonzero(far), _PARTS):
-        if len(part) >= _FEWEST_PER_PART:
-            ways = np.sum(way[part] ** 2), np.sum(B.translation[part] ** 2)
-            found += [0.5 * float(np.log(ways[0] / ways[1]))] if min(ways) > 0 else []
-    if len(found) < _PARTS:
+def _over_strides(A: SE3, B: SE3, ref_from_member: Array) -> RelativeScale | None:
+    """`R_A t - t + t_A = s R t_B` over offsets t and the scale s, robustly; its deviation from leaving out tenths."""
+    rows = np.concatenate([np.eye(3) - A.rotation, (B.translation @ ref_from_member.T)[:, :, None]], axis=2)
+    weights = np.ones(len(rows))
+    for _ in range(_ROUNDS):
+        at = _solved(*_normal(rows, A.translation, weights))
+        if at is None:
+            return None
+        left = np.linalg.norm(rows @ at - A.translation, axis=1)
+        weights = 1 / (1 + (left / max(2 * float(np.median(left)), 1e-9)) ** 2)
+    parts = [
+        _normal(rows[part], A.translation[part], weights[part])
+        for part in np.array_split(np.arange(len(rows)), _PARTS)
+    ]
+    information, right = (np.sum([part[i] for part in parts], axis=0) for i in range(2))
+    without = [_solved(information - H, right - g) for H, g in parts]
+    at = _solved(information, right)
+    others = np.array([x[3] for x in without if x is not None])
+    if at is None or len(others) < _PARTS:
         return None
-    middle = float(np.median(found))
-    spread = 1.4826 * float(np.median(np.abs(np.array(found) - middle)))
-    value = float(np.exp(middle))
-    return RelativeScale(value, value * spread * float(np.sqrt(np.pi / 2 / len(found))))
+    std = float(np.sqrt((_PARTS - 1) / _PARTS * np.sum((others - others.mean()) ** 2)))
+    return RelativeScale(float(at[3]), std) if 0 < std < _USEFUL else None
+
+
+def _normal(rows: Array, right: Array, weights: Array) -> tuple[Array, Array]:
+    """(4, 4) and (4,) of the weighted equations."""
+    by = rows * weights[:, None, None]
+    return np.einsum("nip,niq->pq", by, rows), np.einsum("nip,ni->p", by, right)
+
+
+def _solved(information: Array, right: Array) -> Array | None:
+    """None where offset and scale cannot be told apart. An offset that nothing tells stays at zero."""
+    scale = float(information[3, 3])
+    if scale <= 0:
+        return None
+    offsets = np.linalg.pinv(information[:3, :3], rcond=_SINGULAR, hermitian=True)
+    left = scale - float(information[3, :3] @ offsets @ information[:3, 3])
+    if left < _SINGULAR * scale:
+        return None
+    value = float(right[3] - information[3, :3] @ offsets @ right[:3]) / left
+    return np.append(offsets @ (right[:3] - information[:3, 3] * value), value)
 
 
 def scale_covariance(
