@@ -7,10 +7,13 @@ import pytest
 
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
+from rigwake.pipeline.stream_selection import Selection
+from rigwake.pipeline.vetted_rig import _restamped
 from rigwake.plausibility.exposure_lag import exposure_lag, frame_periods, later_by, restamped
 from rigwake.plausibility.turn_checks import check_clocks
 from rigwake.plausibility.turn_fit import fit_turns
-from rigwake.recording import ImuStream
+from rigwake.recording import CameraStream, ImuStream
+from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
 MOUNT = so3.exp([0.3, -1.0, 0.7])
@@ -78,3 +81,19 @@ def test_stamps_that_would_not_increase_are_left():
     lag = exposure_lag(camera, camera.timestamps_ns, IMU)
     assert lag is not None
     assert later_by(replace(lag, slope=40.0), camera.timestamps_ns) is None
+
+
+def test_frames_tracks_and_path_get_the_same_stamps():
+    camera = path(0.9)
+    stamps = np.sort(np.append(camera.timestamps_ns, camera.timestamps_ns[-1] + 45_000_000))
+    stream = CameraStream("cam", stamps, None, 10, 10)
+    none = np.empty(0, dtype=np.int64)
+    tracks = Tracks("cam", stamps[::2], none, none, np.empty((0, 2)), np.empty((0, 3)), np.empty(0))
+    selection = Selection({"cam": stream, "dark": stream}, IMU, None)
+    after, by_camera, paths, (check,) = _restamped(selection, {"cam": tracks}, {"cam": camera})
+    moved = after.cameras["cam"].timestamps_ns
+    assert np.array_equal(by_camera["cam"].timestamps_ns, moved[::2])
+    assert np.array_equal(paths["cam"].timestamps_ns, moved[:-1])
+    assert after.cameras["dark"] is stream
+    assert check.sensor == "camera cam"
+    assert np.ptp(moved - stamps) == pytest.approx(0.9 * 27e6, rel=0.2)
