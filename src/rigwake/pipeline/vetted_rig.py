@@ -31,10 +31,11 @@ _WORDS = "comparing the sensors"
 
 @dataclass(frozen=True, eq=False)
 class VettedRig:
-    """own: the trajectories that were used, by camera. first: initial values. vetted: the sensors that were used, and
-    what was said of them."""
+    """own, tracks: what was used, by camera. first: initial values. vetted: the sensors that
+    were used, and what was said of them."""
 
     own: Mapping[str, Trajectory]
+    tracks: Mapping[str, Tracks]
     first: InitialRig
     rig: RigEstimate
     vetted: VettedSensors
@@ -146,4 +147,4 @@ def _one_pass(
         progress=progress,
     )
     vetted = replace(vetted, checks=(*mended.checks, *vetted.checks))
-    return VettedRig(own, first, rig, vetted)
+    return VettedRig(own, mended.tracks, first, rig, vetted)
