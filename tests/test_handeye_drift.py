@@ -12,7 +12,7 @@ from rigwake.geometry.se3 import SE3
 from rigwake.handeye.handeye_problem import HandeyeOptions
 from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.pipeline.handeye_run import run_handeye
-from rigwake.plausibility.handeye_drift import check_steadiness, scale_against_reference
+from rigwake.plausibility.handeye_drift import check_steadiness
 from rigwake.trajectory import Trajectory
 
 TIMES = np.arange(600) * 0.15
@@ -37,8 +37,6 @@ def test_good_pairs_are_not_accused(motion, seed: int) -> None:
     rig, port = pair(motion, seed)
     result = calibrate_handeye(rig, [port])
     assert check_steadiness(rig, port, result) == ()
-    scale, std = scale_against_reference(rig, port, result)
-    assert abs(scale - 1) < max(4 * std, 0.01)
 
 
 def test_a_scale_some_percent_off_is_estimated_and_said() -> None:

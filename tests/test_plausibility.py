@@ -105,6 +105,16 @@ def test_a_gyroscope_off_by_three_percent_is_corrected_by_what_cameras_agree_on(
     assert factor == pytest.approx(1 / 1.03, abs=5e-4)
 
 
+@pytest.mark.parametrize(("focal_std", "blamed"), [(0.02, "do not tell which"), (0.002, "scale is wrong")])
+def test_a_camera_whose_lens_is_not_known_does_not_accuse_the_gyroscope_alone(
+    focal_std: float, blamed: str
+) -> None:
+    found = fits(replace(imu(), gyro=1.03 * imu().gyro))
+    checks, factor = check_scale({"left": found["left"]}, BOTH, {"left": focal_std})
+    assert blamed in wrong(checks)["gyroscope"]
+    assert factor is None
+
+
 def test_one_camera_with_another_scale_is_the_camera() -> None:
     found = fits(imu())
     off = {**found, "left": replace(found["left"], scale=1.03), "right": found["front"]}

@@ -264,7 +264,7 @@ def require_one_body(
     """
     left_over = []
     for stride_s in _STRIDES_S:
-        strides = _strides(reference, member, offset_s, stride_s)
+        strides = strides_of_both(reference, member, offset_s, stride_s)
         if strides is None:
             continue
         a, b = strides
@@ -291,7 +291,7 @@ def in_one_unit(reference: Trajectory, member: Trajectory) -> tuple[Trajectory, 
     more, and what was noticed. The clocks must be alike to some seconds; else nothing is noticed."""
     if not (reference.is_metric and member.is_metric):
         return member, None
-    strides = _strides(reference, member, 0.0, _STRIDES_S[1])
+    strides = strides_of_both(reference, member, 0.0, _STRIDES_S[1])
     if strides is None:
         return member, None
     first, second = (np.linalg.norm(s.translation, axis=-1) for s in strides)
@@ -310,7 +310,7 @@ def in_one_unit(reference: Trajectory, member: Trajectory) -> tuple[Trajectory, 
     return replace(member, is_metric=False), Finding("warning", member.name, message)
 
 
-def _strides(
+def strides_of_both(
     reference: Trajectory, member: Trajectory, offset_s: float, stride_s: float
 ) -> tuple[SE3, SE3] | None:
     """Motions of both over the same times; None if they share too few. Breaks of odometry are left out."""

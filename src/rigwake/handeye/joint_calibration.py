@@ -35,6 +35,7 @@ from rigwake.handeye.likelihood import (
 )
 from rigwake.handeye.motions import Mounting, longest_segments, residuals, steps_between
 from rigwake.handeye.observability import covariance, unobservable_directions
+from rigwake.handeye.relative_scale import RelativeScale, relative_scale, scale_covariance
 from rigwake.sync import MIN_OVERLAP, estimate_time_offset
 from rigwake.trajectory import Trajectory
 
@@ -179,6 +180,9 @@ def _result(
 ) -> HandeyeResult:
     total = covariance(problem, estimate)
     reference = problem.reference.trajectory
+    agreement = _scales(problem, estimate)
+    if not problem.has_known_noise:
+        total = total + scale_covariance(problem, estimate, options, agreement)
     rotations = problem.reference.increments[:, :3]
     members, raw, scales = {}, {}, {}
     columns = [at.start + i for at in problem.columns for i in range(6)]
@@ -205,7 +209,11 @@ def _result(
             time_offset_std_s=time_offset_std if time_offset_known else None,
             scale=float(scales[name][0, 0]) if single else None,
             scale_std=float(scales[name][0, 1]) if single else None,
-            statistics={"steps": int(valid.sum()), "poses_left_out": left_out[m]},
+            statistics={
+                "steps": int(valid.sum()),
+                "poses_left_out": left_out[m],
+                "relative_scale": None if (found := agreement[m]) is None else [found.value, found.std],
+            },
         )
     return HandeyeResult(
         reference.name,
@@ -219,6 +227,17 @@ def _result(
         estimate.iterations,
         estimate.converged,
     )
+
+
+def _scales(problem: HandeyeProblem, estimate: HandeyeEstimate) -> list[RelativeScale | None]:
+    """How members that claim metres, and are believed, agree with the reference on them."""
+    reference = problem.reference.trajectory
+    return [
+        None
+        if layout.scale_count
+        else relative_scale(reference, curve.trajectory, mounting.ref_from_member, mounting.time_offset_s)
+        for curve, layout, mounting in zip(problem.members, problem.layouts, estimate.mountings, strict=True)
+    ]
 
 
 def _checked_directions(

@@ -348,6 +348,13 @@ def maximise(
     return solver.estimate(required_ratio, iterations, converged=ahead <= enough)
 
 
+def equations_at(problem: HandeyeProblem, estimate: HandeyeEstimate, options: HandeyeOptions) -> Equations:
+    """The normal equations of `problem`, which may have further unknowns, at the end of another's estimate."""
+    solver = _Solver(problem, estimate.mountings, options)
+    solver.filters = estimate.filters
+    return solver.equations()
+
+
 def information_criterion(problem: HandeyeProblem, estimate: HandeyeEstimate) -> float:
     """Schwarz's criterion (BIC) of learnt noise, lower is better: how well the past predicts each residual.
 

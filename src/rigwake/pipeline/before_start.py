@@ -40,8 +40,9 @@ def check_fields_of_view(config: CalibrateConfig, selection: Selection) -> None:
     """Raises UsageError for fields of view of cameras that are not there, or that nothing is done with."""
     _check_names("fov_deg names", set(config.fov_deg) - {"all"}, selection)
     if config.fov_deg and config.intrinsics != "find":
+        fate = "refined" if config.intrinsics == "refine" else "kept as they are"
         raise UsageError(
-            f"Fields of view are given, and lenses are to be {config.intrinsics}.",
+            f"Fields of view are given, but lenses are to be {fate}.",
             consequence="They would not be used.",
             remedy="Add --intrinsics find, or leave out --fov.",
         )

@@ -53,7 +53,7 @@ from rigwake.readers.trajectories import read_trajectory
 from rigwake.recording import Recording
 from rigwake.report import build_report, load_report_content
 from rigwake.sections.section_words import plan_to_dict
-from rigwake.tracks import load_tracks
+from rigwake.tracks import Tracks, load_tracks
 from rigwake.trajectory import Trajectory
 
 _MOVED_PX = 0.5  # worth a word
@@ -221,7 +221,7 @@ def _conclude(
     }
     notes = (*selection.notes, *(f"{o.name}: {n}" for o in outcomes for n in o.notes), *first.notes)
     notes += _noisy_imu(rig.calibration) + _moved_intrinsics(rig.calibration)
-    notes += _knocks(prepared.opened, rig.calibration, selection, out)
+    notes += _knocks(prepared.opened, rig.calibration, selection, estimated.tracks)
     calibration = replace(
         rig.calibration,
         checks={
@@ -240,11 +240,11 @@ def _conclude(
 
 
 def _knocks(
-    recording: Recording, calibration: Calibration, selection: Selection, out: Path
+    recording: Recording, calibration: Calibration, selection: Selection, tracks: Mapping[str, Tracks]
 ) -> tuple[str, ...]:
     """What the monitor's statistic says of cameras that turned during the recording; nothing without IMU or tracks."""
-    files = {name: tracks_file(out, name) for name in calibration.cameras}
-    if selection.imu is None or len(files) < 2 or not all(file.is_file() for file in files.values()):
+    own = {name: tracks[name] for name in calibration.cameras if name in tracks}
+    if selection.imu is None or len(own) < max(2, len(calibration.cameras)):
         return ()
     opened = replace(
         recording,
@@ -253,7 +253,7 @@ def _knocks(
         gnss={} if selection.gnss is None else {selection.gnss.name: selection.gnss},
     )
     try:
-        return knocks_inside(calibration, opened, {name: load_tracks(file) for name, file in files.items()})
+        return knocks_inside(calibration, opened, own)
     except (RigwakeError, LinAlgError) as error:  # the result is not written yet: nothing here may cost it
         why = getattr(error, "cause", "its tracks tell too little.")
         return (f"Whether a camera moved during the recording was not checked: {why}",)

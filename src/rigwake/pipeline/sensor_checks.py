@@ -131,7 +131,8 @@ def compare_sensors(
     sound = frozenset(name for name, fit in lenses.items() if not is_off(fit, models[name].width_px))
     fits, found = _fit_all(trajectories, imu)
     checks += found
-    fits, imu, found = _scaled(trajectories, fits, imu, sound, repair)
+    focal_stds = {name: float(np.sqrt(max(fit.covariance[0, 0], 0.0))) for name, fit in lenses.items()}
+    fits, imu, found = _scaled(trajectories, fits, imu, sound, focal_stds, repair)
     checks += [*found, *check_clocks(fits)]
     # a wrong axis of the gyroscope looks like a mount of every camera that moves; a wrong focal length looks like a
     # wrong axis: it scales turns about two axes of the camera, not those about the optical axis
@@ -237,10 +238,11 @@ def _scaled(
     fits: dict[str, TurnFit],
     imu: ImuStream,
     sound: frozenset[str],
+    focal_stds: Mapping[str, float],
     repair: bool,
 ) -> tuple[dict[str, TurnFit], ImuStream, list[SensorCheck]]:
     """The gyroscope's scale, corrected where several cameras with sound lenses agree on it."""
-    found, factor = check_scale(fits, sound)
+    found, factor = check_scale(fits, sound, focal_stds)
     if factor is None or not repair:
         return fits, imu, list(found)
     again = {n: fit_turns(trajectories[n], replace(imu, gyro=imu.gyro * factor)) for n in fits}

@@ -20,6 +20,8 @@ from rigwake.pipeline.prior import RigPrior
 from rigwake.pipeline.rig_stage import RigEstimate, estimate_rig, initialise_rig
 from rigwake.pipeline.sensor_checks import VettedSensors, vet_sensors
 from rigwake.pipeline.stream_selection import Selection
+from rigwake.plausibility.exposure_lag import exposure_lags, later_by, restamped
+from rigwake.plausibility.values import SensorCheck
 from rigwake.recording import Recording
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
@@ -29,10 +31,11 @@ _WORDS = "comparing the sensors"
 
 @dataclass(frozen=True, eq=False)
 class VettedRig:
-    """own: the trajectories that were used, by camera. first: initial values. vetted: the sensors that were used, and
-    what was said of them."""
+    """own, tracks: what was used, by camera. first: initial values. vetted: the sensors that
+    were used, and what was said of them."""
 
     own: Mapping[str, Trajectory]
+    tracks: Mapping[str, Tracks]
     first: InitialRig
     rig: RigEstimate
     vetted: VettedSensors
@@ -61,6 +64,9 @@ def estimate_vetted_rig(
 
     Raises InputError that names a sensor that cannot be right, and as `initialise_rig` and `estimate_rig`.
     """
+    by_stamps: tuple[SensorCheck, ...] = ()
+    if config.sensor_checks and config.repair:
+        selection, tracks, trajectories, by_stamps = _restamped(selection, tracks, trajectories)
     mended = MendedLenses(selection, tracks, trajectories)
     odometry = None if external else replace(config.odometry, seed=config.seed)
     refines = config.intrinsics != "fixed" and config.repair
@@ -77,7 +83,25 @@ def estimate_vetted_rig(
             nobody: frozenset[str] = frozenset()
             found = _one_pass(recording, again, config, prior, masks, without_horizon, nobody, progress)
         refuse_contradicted(again, found.rig.lenses)
-    return found
+    return replace(found, vetted=replace(found.vetted, checks=(*by_stamps, *found.vetted.checks)))
+
+
+def _restamped(
+    selection: Selection, tracks: Mapping[str, Tracks], trajectories: Mapping[str, Trajectory]
+) -> tuple[Selection, dict[str, Tracks], dict[str, Trajectory], tuple[SensorCheck, ...]]:
+    """Stamps that depend on how long a frame lasts, corrected everywhere."""
+    cameras, tracks, paths = dict(selection.cameras), dict(tracks), dict(trajectories)
+    stamps = {name: cameras[name].timestamps_ns for name in paths}
+    lags = {} if selection.imu is None else exposure_lags(paths, stamps, selection.imu)
+    checks = []
+    for name, lag in lags.items():
+        if (moved := later_by(lag, stamps[name])) is None:
+            continue
+        cameras[name] = replace(cameras[name], timestamps_ns=stamps[name] + moved)
+        tracks[name] = restamped(tracks[name], stamps[name], moved)
+        paths[name] = restamped(paths[name], stamps[name], moved)
+        checks.append(lag.check(name))
+    return replace(selection, cameras=cameras), tracks, paths, tuple(checks)
 
 
 def _without_association(config: CalibrateConfig) -> CalibrateConfig:
@@ -123,4 +147,4 @@ def _one_pass(
         progress=progress,
     )
     vetted = replace(vetted, checks=(*mended.checks, *vetted.checks))
-    return VettedRig(own, first, rig, vetted)
+    return VettedRig(own, mended.tracks, first, rig, vetted)

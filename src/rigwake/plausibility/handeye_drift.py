@@ -82,26 +82,6 @@ def check_steadiness(
     return tuple(check for check in found if check)
 
 
-def scale_against_reference(
-    reference: Trajectory, member: Trajectory, result: HandeyeResult
-) -> tuple[float, float]:
-    """By what the lengths of a member must be multiplied to be those of the reference, and its standard deviation.
-
-    NaN where the recording is too short, one of both has no unit, or the result holds a scale already.
-    """
-    strides = _strides(reference, member, result)
-    scaled = len(result.scales.get(member.name, ())) > 0
-    if strides is None or scaled or not (member.is_metric and reference.is_metric):
-        return np.nan, np.nan
-    blocks = _blocks(strides)
-    if len(blocks.times_s) < _FEWEST_BLOCKS:
-        return np.nan, np.nan
-    change, covariance = _solve(
-        blocks.H.sum(axis=0), blocks.g.sum(axis=0), _variance_between_neighbours(blocks)
-    )
-    return 1.0 + float(change[_SCALE]), float(np.sqrt(covariance[_SCALE, _SCALE]))
-
-
 def _strides(reference: Trajectory, member: Trajectory, result: HandeyeResult) -> _StrideResiduals | None:
     camera, X = result.members[member.name], result.ref_from_members[member.name]
     if not np.isfinite(X.matrix).all():

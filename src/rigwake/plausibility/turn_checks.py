@@ -18,6 +18,7 @@ EXPLAINED = 0.15
 _SCALE = 0.01
 _AGREED = 0.004  # spread of the scales that cameras ask for, to be one scale
 _SIGMAS = 6.0
+_SURE = 3.0
 _DRIFT = 2.5e-4
 _TURNED = np.deg2rad(0.2)
 # by which the robust cost falls when a knock is undone: one bad rotation among many gains 0.1
@@ -26,12 +27,13 @@ _FEWEST = 8  # strides on either side of a change
 
 
 def check_scale(
-    fits: Mapping[str, TurnFit], sound_lenses: frozenset[str]
+    fits: Mapping[str, TurnFit], sound_lenses: frozenset[str], focal_stds: Mapping[str, float] | None = None
 ) -> tuple[tuple[SensorCheck, ...], float | None]:
     """The gyroscope's scale by cameras whose lens is known to be right, and the factor that corrects it.
 
-    Cameras that stand alone with a wrong scale are checks of their own. The factor is None where none is needed, or
-    where fewer than two cameras agree on one.
+    focal_stds: how well tracks tell the focal lengths, as a part of them: one camera whose lens they do not tell
+    accuses both. Cameras that stand alone with a wrong scale are checks of their own. The factor is None where none
+    is needed, or where fewer than two cameras agree on one.
     """
     quantity = "a camera's turns over the gyroscope's"
     known = {n: f for n, f in fits.items() if f.unexplained <= EXPLAINED and n in sound_lenses}
@@ -44,14 +46,28 @@ def check_scale(
         checks += [_camera_scale(name, fit) for name, fit in off.items()]
         return tuple(checks), None
     spread = max(abs(f.scale / middle - 1) for f in off.values())
-    words = (
-        f"its scale is wrong: {', '.join(f'{n} turned by {f.scale:.4f} of it' for n, f in sorted(off.items()))}, "
-        "although the lenses fit their own tracks"
-    )
-    remedy = "Calibrate the gyroscope's scale, or check its unit and the rate that its stamps claim."
+    words, remedy = _scale_words(off, focal_stds or {})
     check = SensorCheck("gyroscope", False, middle, 1.0, f"{words}.", remedy, quantity)
     agreed = len(off) >= 2 and spread < _AGREED and abs(middle - 1) < 0.1
     return (check,), middle if agreed else None
+
+
+def _scale_words(off: Mapping[str, TurnFit], focal_stds: Mapping[str, float]) -> tuple[str, str]:
+    """What is wrong where these cameras turned otherwise than the gyroscope says, and the remedy."""
+    name, fit = next(iter(off.items()))
+    if len(off) == 1 and _SURE * focal_stds.get(name, 0.0) > abs(fit.scale - 1):
+        words = (
+            f"it does not agree with {name}, which turned by {fit.scale:.4f} of it: its scale, the focal length, or an "
+            f"unknown read-out time of {name} is to blame; the tracks do not tell which"
+        )
+        remedy = (
+            "Calibrate the lens (`rigwake intrinsics`) and the gyroscope's scale; of a rolling shutter say how long a "
+            f"row takes to be read (--set 'line_delay_s={{{name}: 3e-5}}')."
+        )
+        return words, remedy
+    turned = ", ".join(f"{n} turned by {f.scale:.4f} of it" for n, f in sorted(off.items()))
+    words = f"its scale is wrong: {turned}, although the lenses fit their own tracks"
+    return words, "Calibrate the gyroscope's scale, or check its unit and the rate that its stamps claim."
 
 
 def scale_of_lenses(
