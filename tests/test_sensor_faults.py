@@ -7,19 +7,23 @@ import numpy as np
 import pytest
 
 from rigwake.geometry import so3
+from rigwake.geometry.se3 import SE3
 from rigwake.pipeline import sensor_checks
+from rigwake.plausibility import force_fit, turn_checks
 from rigwake.plausibility.coarse_turns import vet_turns
 from rigwake.plausibility.force_checks import check_forces, compare_forces
+from rigwake.plausibility.force_fit import ForceEquations
 from rigwake.plausibility.gyro_axes import check_axes
 from rigwake.plausibility.imu_samples import vet_samples
 from rigwake.plausibility.lens_fit import LensFit
 from rigwake.plausibility.receiver_checks import VettedReceiver
 from rigwake.plausibility.receiver_fit import ReceiverFit
-from rigwake.plausibility.receiver_repeats import repeated_rows
+from rigwake.plausibility.receiver_repeats import repeated_rows, with_rounding
 from rigwake.plausibility.receiver_wrongs import rows_of_one_level
 from rigwake.plausibility.stamp_rates import rate_of_stamps
-from rigwake.plausibility.turn_checks import check_mounts
+from rigwake.plausibility.turn_checks import check_mounts, mount_change
 from rigwake.recording import GnssStream, ImuStream
+from rigwake.tracking.camera_rotations import _from_the_middle
 from rigwake.tracking.front_ends import _TrackingRun
 from test_plausibility import drifting, fits, gnss, imu, paths, vetted, world, wrong
 
@@ -170,6 +174,55 @@ def test_coarse_digits_of_a_slow_vessel_are_no_fixes_sent_again() -> None:
     assert not repeated_rows(slow).any()
     again = np.repeat(way[::5], 5, axis=0) * 5  # fine digits, a fix a second sent five times
     assert repeated_rows(replace(slow, position_enu=again)).mean() > 0.7
+
+
+def test_rounded_fixes_have_the_noise_of_their_last_digit() -> None:
+    given = gnss()
+    assert with_rounding(given)[1] == 0
+    coarse = replace(given, position_enu=np.round(given.position_enu / [0.6, 1.1, 0.1]) * [0.6, 1.1, 0.1])
+    found, digit = with_rounding(coarse)
+    assert digit == pytest.approx(1.1)
+    wider = found.covariances - given.covariances
+    assert wider[0] == pytest.approx(np.diag([1.1**2 / 12, 1.1**2 / 12, 0.0]))
+    assert any("rounded to 1.10 m" in c.hypothesis and c.agrees for c in vetted(coarse).checks)
+
+
+@pytest.mark.parametrize("rate_hz", [6.0, 30.0])
+def test_coarse_turns_last_however_many_pictures_there_are(rate_hz: float) -> None:
+    stamps = np.round(np.arange(1000) * 1e9 / rate_hz).astype(np.int64)
+    chosen = _from_the_middle(stamps, 150)
+    assert len(chosen) == 150
+    assert (stamps[chosen[-1]] - stamps[chosen[0]]) * 1e-9 > 14
+    assert 0 <= chosen[0] + chosen[-1] - 999 + 3 <= 6
+    assert len(_from_the_middle(stamps[:40], 150)) == (40 if rate_hz == 6.0 else 14)
+
+
+def test_the_time_of_a_change_is_found_in_long_recordings_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    path = paths()["front"]
+    rotation = path.world_from_body.rotation.copy()
+    rotation[len(path) // 3 :] = rotation[len(path) // 3 :] @ so3.exp(np.array([0.0, 0.0, 0.9]))
+    segments = (np.arange(len(path)) >= len(path) // 3).astype(
+        np.int64
+    )  # lost in between: no stride shows the knock
+    changed = replace(
+        path, world_from_body=SE3(rotation, path.world_from_body.translation), segment_ids=segments
+    )
+    fit = fits(imu(), {"front": changed})["front"]
+    fine = mount_change(fit)
+    monkeypatch.setattr(turn_checks, "_MOST_SPLITS", 5)
+    coarse = mount_change(fit)
+    assert fine is not None
+    assert coarse is not None
+    assert coarse.at_ns == fine.at_ns
+
+
+def test_forces_of_long_recordings_are_sampled(monkeypatch: pytest.MonkeyPatch) -> None:
+    fit = fits(imu())["front"]
+    whole = ForceEquations(paths()["front"], imu(), fit).solve(np.eye(3))
+    monkeypatch.setattr(force_fit, "_MOST", 40)
+    some = ForceEquations(paths()["front"], imu(), fit)
+    assert len(some.force) == 40
+    assert some.solve(np.eye(3)).scale == pytest.approx(whole.scale, rel=0.05)
 
 
 def test_a_receiver_that_never_moves_is_left_out() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -63,20 +63,9 @@ def compare_forces(
         alone = tuple(equations.alone(axis) for axis in range(3))
         delays = {}
         if min(best.left, *(axis.left for axis in alone)) > _WORTH_ASKING * best.moved:
-            delays = {s: _left(trajectories[name], _ahead(imu, s), fit) for s in _DELAYS_S}
+            delays = {s: equations.ahead(s).solve(np.eye(3)).left for s in _DELAYS_S}
         found[name] = ForceVerdict(fits[0], best, alone, delays)
     return found
-
-
-def _ahead(imu: ImuStream, seconds: float) -> ImuStream:
-    """The IMU with forces that were measured so much later than its stamps say."""
-    times = (imu.timestamps_ns - imu.timestamps_ns[0]) * 1e-9
-    moved = [np.interp(times + seconds, times, imu.accel[:, k]) for k in range(3)]
-    return replace(imu, accel=np.stack(moved, axis=1))
-
-
-def _left(trajectory: Trajectory, imu: ImuStream, fit: TurnFit) -> float:
-    return ForceEquations(trajectory, imu, fit).solve(np.eye(3)).left
 
 
 def check_forces(verdicts: Mapping[str, ForceVerdict]) -> tuple[SensorCheck, ...]:

@@ -12,6 +12,7 @@ tried, and the one that leaves least is right. Nothing but the bias is believed 
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 
@@ -28,7 +29,7 @@ from rigwake.trajectory import Trajectory
 GRAVITY = 9.80665
 _H_S = 0.5
 _BIAS_STD, _LEVER_STD = 0.3, 5.0
-_FEWEST = 16
+_FEWEST, _MOST = 16, 1200  # windows; of a long recording so many, spread over it, tell as much as is asked
 _MEDIAN_LENGTH = {2: 1.18, 3: 1.54}  # of vectors whose components have a standard deviation of one
 
 
@@ -87,6 +88,8 @@ class ForceEquations:
         centres = np.arange(first, last, round(0.5 * _H_S * 1e9))
         if len(centres) < _FEWEST:
             raise UnobservableError(f"{trajectory.name}: too short together with {imu.name}.")
+        if len(centres) > _MOST:
+            centres = centres[np.linspace(0, len(centres) - 1, _MOST).astype(np.int64)]
         h = round(_H_S * 1e9)
         shift = round(turns.time_offset_s * 1e9)
         at = [
@@ -102,7 +105,16 @@ class ForceEquations:
         self.to_world = self.world_from_imu @ self.to_world
         self.path_term = (at[0].translation - 2 * at[1].translation + at[2].translation) / _H_S**2
         self.lever_term = (at[0].rotation - 2 * at[1].rotation + at[2].rotation) / _H_S**2
+        self.imu, self.start_from_imu, self.centres = imu, turned.rotation, centres
         self._integrals(imu, turned.rotation, centres)
+
+    def ahead(self, seconds: float) -> ForceEquations:
+        """The same with forces that were measured so much later than their stamps say."""
+        times = (self.imu.timestamps_ns - self.imu.timestamps_ns[0]) * 1e-9
+        moved = [np.interp(times + seconds, times, self.imu.accel[:, k]) for k in range(3)]
+        found = copy(self)
+        found._integrals(replace(self.imu, accel=np.stack(moved, axis=1)), self.start_from_imu, self.centres)
+        return found
 
     def _integrals(self, imu: ImuStream, start_from_imu: Array, centres: Stamps) -> None:
         """Forces and rotations under the triangle round every centre: (N, 3, 3, 3) and (N, 3, 3)."""
