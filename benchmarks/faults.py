@@ -234,7 +234,7 @@ FAULTS: dict[str, tuple[str, Callable[[Faulty], None]]] = {
     "every second picture of one camera lost": ("", images_lost),
     "lens files of two cameras exchanged": ("camera", zoomed_and_exchanged),
     "pictures of one camera halved against its lens": (
-        "camera", lambda f: f.change_images(f.cameras[0], halved)),
+        "front", lambda f: f.change_images(f.cameras[0], halved)),
     "pictures of one camera cropped": ("camera", cropped),
     "pictures of one camera a quarter turned": ("camera", quarter_turned),
     "pictures of one camera exchanged with their neighbours": ("camera", permuted),
