@@ -15,7 +15,9 @@ from rigwake.plausibility.force_checks import check_forces, compare_forces
 from rigwake.plausibility.force_fit import ForceEquations
 from rigwake.plausibility.gyro_axes import check_axes
 from rigwake.plausibility.imu_samples import vet_samples
-from rigwake.plausibility.lens_fit import LensFit
+from rigwake.plausibility.jitter_checks import check_jitter
+from rigwake.plausibility.lens_checks import check_lenses
+from rigwake.plausibility.lens_fit import LensFit, fit_lens
 from rigwake.plausibility.receiver_checks import VettedReceiver
 from rigwake.plausibility.receiver_fit import ReceiverFit
 from rigwake.plausibility.receiver_repeats import repeated_rows, with_rounding
@@ -254,6 +256,50 @@ def test_pictures_shown_again_later_are_repeated_ones() -> None:
     assert [run.judge(p) for p in (*pictures, *pictures[1:3], pictures[3])] == ["usable"] * 4 + [
         "repeated"
     ] * 3
+
+
+@pytest.mark.parametrize(("size_s", "agrees"), [(0.0, True), (0.008, True), (0.03, False)])
+def test_stamps_that_jitter_are_named(size_s: float, agrees: bool) -> None:
+    front = paths()["front"]
+    off = np.random.default_rng(1).normal(0, size_s, len(front))
+    stamps = np.maximum.accumulate(front.timestamps_ns + np.round(off * 1e9).astype(np.int64))
+    shaken = {**paths(), "front": replace(front, timestamps_ns=stamps + np.arange(len(stamps)))}
+    checks = check_jitter(shaken, imu(), fits(imu(), shaken))
+    assert [c.sensor for c in checks] == (["camera front"] if size_s else [])
+    assert all(c.agrees == agrees and c.statistic == pytest.approx(size_s, rel=0.4) for c in checks)
+
+
+def test_stamps_of_all_cameras_in_steps_may_be_the_fault_of_the_imu() -> None:
+    coarse = {
+        n: replace(p, timestamps_ns=p.timestamps_ns // 70_000_000 * 70_000_000) for n, p in paths().items()
+    }
+    checks = check_jitter(coarse, imu(), fits(imu(), coarse))
+    assert [c.sensor for c in checks] == ["imu"]
+    assert not checks[0].agrees
+
+
+def test_a_camera_that_the_gyroscope_explains_less_than_the_others_is_odd() -> None:
+    good = fits(imu())["front"]
+    rng = np.random.default_rng(0)
+    size = 0.25 * np.linalg.norm(good.camera_turns, axis=1).mean()
+    poor = replace(good, residuals=rng.normal(0, size, good.residuals.shape))
+    assert 0.15 < poor.unexplained < 0.5
+    assert set(sensor_checks._odd_ones({"front": poor, "left": good, "right": good})) == {"front"}
+    assert not sensor_checks._odd_ones({"front": poor, "left": poor})
+    assert not sensor_checks._odd_ones({"front": good, "left": good})
+
+
+def test_a_focal_length_that_grows_is_named() -> None:
+    seen, lens = world().tracks["front"], world().recording.cameras["front"].model
+    assert lens is not None
+    centre = lens.project(np.array([[0.0, 0.0, 1.0]]))[0][0]
+    when = seen.frame_indices / seen.frame_indices.max()
+    breathing = replace(seen, pixels=centre + (seen.pixels - centre) * (1 + 0.03 * when)[:, None])
+    for tracks, agrees in ((seen, True), (breathing, False)):
+        fitted = {"front": replace(fit_lens(seen, lens, paths()["front"]), refined_rms_px=0.05)}
+        checks = check_lenses(fitted, {"front": tracks}, {"front": lens}, paths())
+        assert checks[0].agrees == agrees
+    assert "its focal length changes" in checks[0].hypothesis
 
 
 def test_a_rate_is_not_looked_for_where_nothing_turns() -> None:
