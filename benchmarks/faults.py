@@ -217,7 +217,7 @@ FAULTS: dict[str, tuple[str, Callable[[Faulty], None]]] = {
         f.cameras[0], lambda s: s // 50_000_000 * 50_000_000)),
     "IMU low-pass filtered over 0.1 s": ("", lambda f: f.edit("imu.csv", smoothed)),
     "accelerometer 0.1 s behind the gyroscope": ("accelerometer", lagging(slice(3, 6), 0.1)),
-    "gyroscope alone low-pass filtered, 0.1 s late": ("", gyroscope_late),
+    "gyroscope alone low-pass filtered, 0.1 s late": ("gyroscope", gyroscope_late),
     "gyroscope in deg/s, x and y exchanged": (
         "gyroscope", imu(lambda v: v.__setitem__((slice(None), slice(0, 3)), np.rad2deg(v[:, [1, 0, 2]])))),
     "gyroscope turned by 4 deg against the accelerometer": ("", imu(turned_against(slice(0, 3), 4.0))),

@@ -106,6 +106,9 @@ def test_an_axis_a_bias_or_a_delay_of_the_accelerometer_is_named() -> None:
     assert "y axis shows 1.9" in forces(lambda a: a * [1.0, 2.0, 1.0])
     assert "its bias is (1.9" in forces(lambda a: a + np.array([2.0, 0.0, 0.0]))
     assert "0.3 s too late" in forces(lambda a: np.concatenate([a[:30], a[:-30]]))
+    assert "0.1 s too early" in forces(lambda a: np.concatenate([a[10:], a[-10:]]))
+    small = replace(imu(), accel=np.concatenate([imu().accel[:2], imu().accel[:-2]]))
+    assert not wrong(check_forces(compare_forces(paths(), small, fits(imu()))))
 
 
 def with_heights(change: Callable[[np.ndarray], np.ndarray]) -> VettedReceiver:

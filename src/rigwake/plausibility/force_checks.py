@@ -29,6 +29,7 @@ MOST_BIAS = 1.5  # m/s^2; what the cheapest MEMS accelerometers have, uncalibrat
 _LEAST_TOLD, _TOLD_STDS = 0.15, 4.0  # what an axis should show, m/s^2 and over what the others leave
 _LEAST_SLOPE, _MOST_SLOPE = 0.5, 1.6
 _WORTH_ASKING = 0.15  # of the accelerations: good recordings leave a tenth of that where they tell anything
+_DELAY_S, _DELAY_SIGMAS, _FITTING = 0.04, 8.0, 0.5
 _DELAYS_S = tuple(sign * s for s in (0.05, 0.1, 0.2, 0.3, 0.4, 0.6) for sign in (1.0, -1.0))
 
 
@@ -37,13 +38,14 @@ class ForceVerdict:
     """Of one camera: the fit as given, the best of all readings of the axes, and every axis against the others.
 
     delays: what is left, m/s^2, by seconds that the accelerometer is suspected to be behind the gyroscope; empty where
-    there was no need to ask.
+    there was no need to ask. delay: the same as an unknown of the fit, with its deviation; for small ones.
     """
 
     given: ForceFit
     best: ForceFit
     axes: tuple[AxisFit, ...] = ()
     delays: Mapping[float, float] = field(default_factory=dict)
+    delay: tuple[float, float] = (0.0, np.inf)
 
 
 def compare_forces(
@@ -64,7 +66,7 @@ def compare_forces(
         delays = {}
         if min(best.left, *(axis.left for axis in alone)) > _WORTH_ASKING * best.moved:
             delays = {s: equations.ahead(s).solve(np.eye(3)).left for s in _DELAYS_S}
-        found[name] = ForceVerdict(fits[0], best, alone, delays)
+        found[name] = ForceVerdict(fits[0], best, alone, delays, equations.delay())
     return found
 
 
@@ -133,7 +135,7 @@ def _of_itself(verdicts: Mapping[str, ForceVerdict]) -> SensorCheck | None:
     if len(delayed) * 2 > len(verdicts):
         late = float(np.median(delayed))
         side = "late" if late > 0 else "early"
-        words = f"its samples are stamped {abs(late):g} s too {side} against the gyroscope's."
+        words = f"its samples are stamped {abs(late):.2g} s too {side} against the gyroscope's."
         remedy = "Stamp gyroscope and accelerometer together, when they are read."
         return SensorCheck("accelerometer", False, late, 0.0, words, remedy, "delay behind the gyroscope, s")
     return None
@@ -142,9 +144,11 @@ def _of_itself(verdicts: Mapping[str, ForceVerdict]) -> SensorCheck | None:
 def _delay(v: ForceVerdict) -> float | None:
     """The delay that makes the forces fit; None where none does."""
     best = min(v.delays, key=lambda s: v.delays[s], default=None)
-    if best is None or v.delays[best] > _CLEARLY_BETTER * min(v.given.left, v.best.left):
-        return None
-    return best
+    if best is not None and v.delays[best] <= _CLEARLY_BETTER * min(v.given.left, v.best.left):
+        return best
+    seconds, std = v.delay
+    fits = v.given.left < _FITTING * v.given.moved  # else it may be anything
+    return seconds if fits and abs(seconds) > max(_DELAY_S, _DELAY_SIGMAS * std) else None
 
 
 def _is_deaf(axis: AxisFit, given: ForceFit) -> bool:

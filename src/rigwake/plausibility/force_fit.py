@@ -30,6 +30,8 @@ GRAVITY = 9.80665
 _H_S = 0.5
 _BIAS_STD, _LEVER_STD = 0.3, 5.0
 _FEWEST, _MOST = 16, 1200  # windows; of a long recording so many, spread over it, tell as much as is asked
+_DELAY_STEP_S, _DELAY_STD_S = 0.05, 1.0
+_ALIKE = 8  # neighbouring windows whose errors count as one
 _MEDIAN_LENGTH = {2: 1.18, 3: 1.54}  # of vectors whose components have a standard deviation of one
 
 
@@ -142,6 +144,25 @@ class ForceEquations:
             axes, float(x[0]), float(stds[0] / max(abs(x[0]), 1e-12)), x[1:4], rms, reach, x[7:], stds[7:]
         )
 
+    def delay(self) -> tuple[float, float]:
+        """Seconds by which the forces are stamped late, as an unknown beside the others, and its deviation.
+
+        By how the forces change with the stamps: good to about a third of a second.
+        """
+        right, late, early = (
+            np.einsum("naxx->na", e.force)
+            for e in (self, self.ahead(_DELAY_STEP_S), self.ahead(-_DELAY_STEP_S))
+        )
+        changing = (early - late) / (2 * _DELAY_STEP_S)
+        columns = np.concatenate([self._columns(), changing[:, :, None]], axis=2)
+        x, H, size, off = self._least(columns, right)
+        weights = 1 / (1 + (off / (3 * size)) ** 2)
+        scores = np.einsum("nar,n,na->nr", columns, weights, np.einsum("nar,r->na", columns, x) - right)
+        sums = np.add.reduceat(scores, np.arange(0, len(scores), _ALIKE), axis=0)
+        inverse = np.linalg.inv(H)
+        scattered = float((inverse @ (sums.T @ sums) @ inverse)[10, 10])
+        return float(x[10]), float(np.sqrt(max(scattered, 2.0 * size**2 * float(inverse[10, 10]))))
+
     def alone(self, axis: int) -> AxisFit:
         """One axis of the accelerometer against what the two others and vision say of it.
 
@@ -172,17 +193,18 @@ class ForceEquations:
         return columns
 
     def _least(self, columns: Array, right: Array) -> tuple[Array, Array, float, Array]:
-        """Unknowns (10,), their information for a residual of one, its robust size per axis, and residuals (N,)."""
-        n, axes = right.shape
-        A, b = columns.reshape(-1, 10), right.reshape(-1)
-        prior = np.zeros(10)
+        """Unknowns (C,), their information for a residual of one, its robust size per axis, and residuals (N,)."""
+        (n, axes), free = right.shape, columns.shape[2]
+        A, b = columns.reshape(-1, free), right.reshape(-1)
+        prior = np.zeros(free)
         weights: Array = np.ones(n)
-        x: Array = np.zeros(10)
-        size, H = 0.1, np.eye(10)
+        x: Array = np.zeros(free)
+        size, H = 0.1, np.eye(free)
         for _ in range(8):
-            prior[4:7], prior[7:] = (size / _LEVER_STD) ** 2, (size / _BIAS_STD) ** 2
+            prior[4:7], prior[7:10] = (size / _LEVER_STD) ** 2, (size / _BIAS_STD) ** 2
+            prior[10:] = (size / _DELAY_STD_S) ** 2
             w = np.repeat(weights, axes)
-            H = (A * w[:, None]).T @ A + np.diag(prior) + 1e-12 * np.eye(10) * self.unit**2
+            H = (A * w[:, None]).T @ A + np.diag(prior) + 1e-12 * np.eye(free) * self.unit**2
             x = np.asarray(np.linalg.solve(H, A.T @ (w * b)), dtype=np.float64)
             off = np.linalg.norm((A @ x - b).reshape(-1, axes), axis=1)
             size = max(float(np.median(off)) / _MEDIAN_LENGTH[axes], 1e-4)
