@@ -211,14 +211,16 @@ def _fit_all(
         worst = float(np.median(list(unrelated.values())))
         words = f"it leaves {100 * worst:.0f} % of every camera's turns unexplained, at any mounting and time offset."
         remedy = "Check that the IMU belongs to this recording, its axes, unit and stamps."
-        rates = [r for name in unrelated if (r := _rate(imu, trajectories[name])) is not None]
+        rates = [
+            r for name in unrelated if (r := _rate(imu, trajectories[name], unrelated[name])) is not None
+        ]
         if len(rates) * 2 > len(unrelated):
             words += f" They agree if its stamps run {1 / float(np.median(rates)):.3f} times as fast as the cameras'."
         return {}, [SensorCheck("gyroscope", False, worst, _UNRELATED, words, remedy, quantity)]
     checks = []
     for name, figure in unrelated.items():
         words = f"the gyroscope explains only {100 * (1 - figure):.0f} % of its turns, at any mounting and time offset."
-        if (rate := _rate(imu, trajectories[name])) is not None:
+        if (rate := _rate(imu, trajectories[name], figure)) is not None:
             words += f" It agrees if its stamps run {rate:.3f} times as fast as the IMU's."
         remedy = (
             "Check that its pictures belong to this recording, are neither turned nor cut, and their stamps."
@@ -238,14 +240,14 @@ def _odd_ones(fits: Mapping[str, TurnFit]) -> dict[str, float]:
     }
 
 
-def _rate(imu: ImuStream, trajectory: Trajectory) -> float | None:
+def _rate(imu: ImuStream, trajectory: Trajectory, unexplained: float) -> float | None:
     """Seconds of the camera per second of the IMU where that, and nothing else, makes their turns agree; else None."""
     rate = rate_of_stamps(imu, trajectory)
     try:
-        explained = rate is not None and fit_turns(trajectory, with_rate(imu, rate)).unexplained < 0.3
+        left = 1.0 if rate is None else fit_turns(trajectory, with_rate(imu, rate)).unexplained
     except RigwakeError:
         return None
-    return rate if explained else None
+    return rate if left < min(0.3, 0.5 * unexplained) else None
 
 
 def _scaled(
