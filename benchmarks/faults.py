@@ -220,7 +220,7 @@ FAULTS: dict[str, tuple[str, Callable[[Faulty], None]]] = {
     "gyroscope alone low-pass filtered, 0.1 s late": ("gyroscope", gyroscope_late),
     "gyroscope in deg/s, x and y exchanged": (
         "gyroscope", imu(lambda v: v.__setitem__((slice(None), slice(0, 3)), np.rad2deg(v[:, [1, 0, 2]])))),
-    "gyroscope turned by 4 deg against the accelerometer": ("", imu(turned_against(slice(0, 3), 4.0))),
+    "gyroscope turned by 4 deg against the accelerometer": ("gyroscope", imu(turned_against(slice(0, 3), 4.0))),
     "gyroscope range of 0.25 rad/s": ("gyroscope", imu(limited(0.25))),
     "IMU at 10 Hz": ("", thinned("imu.csv", 10)),
     "IMU stamps of another year": ("", stamps_of("imu.csv", late(4e7))),

@@ -107,6 +107,11 @@ def test_an_axis_a_bias_or_a_delay_of_the_accelerometer_is_named() -> None:
     assert "its bias is (1.9" in forces(lambda a: a + np.array([2.0, 0.0, 0.0]))
     assert "0.3 s too late" in forces(lambda a: np.concatenate([a[:30], a[:-30]]))
     assert "0.1 s too early" in forces(lambda a: np.concatenate([a[10:], a[-10:]]))
+    biased = check_forces(
+        compare_forces(paths(), replace(imu(), accel=imu().accel + np.array([0.9, 0.0, 0.0])), fits(imu()))
+    )
+    assert [c.agrees for c in biased] == [True]
+    assert "its bias is 0." in biased[0].hypothesis
     small = replace(imu(), accel=np.concatenate([imu().accel[:2], imu().accel[:-2]]))
     assert not wrong(check_forces(compare_forces(paths(), small, fits(imu()))))
 

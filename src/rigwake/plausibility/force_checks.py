@@ -25,6 +25,7 @@ _KNOWN_ROTATION = np.deg2rad(2.0)
 _CLEARLY_BETTER = 0.6
 _SIGN_SIGMAS = 6.0
 _GRAVITY_TOLERANCE = 0.12
+_LARGE_BIAS = 0.4  # m/s^2, worth a word
 MOST_BIAS = 1.5  # m/s^2; what the cheapest MEMS accelerometers have, uncalibrated, is below 1
 _LEAST_TOLD, _TOLD_STDS = 0.15, 4.0  # what an axis should show, m/s^2 and over what the others leave
 _LEAST_SLOPE, _MOST_SLOPE = 0.5, 1.6
@@ -80,7 +81,8 @@ def check_forces(verdicts: Mapping[str, ForceVerdict]) -> tuple[SensorCheck, ...
         return (own,)
     if len(wrong) * 2 <= len(verdicts):
         left = float(np.median([v.given.left for v in verdicts.values()]))
-        sound = SensorCheck("accelerometer", True, left, left, quantity=quantity)
+        words, advice = _large_bias(verdicts)
+        sound = SensorCheck("accelerometer", True, left, left, words, advice, quantity)
         return (sound, *(_mirrored(name, verdicts[name]) for name in wrong))
     name = min(wrong, key=lambda n: verdicts[n].best.left)
     v = verdicts[name]
@@ -90,6 +92,21 @@ def check_forces(verdicts: Mapping[str, ForceVerdict]) -> tuple[SensorCheck, ...
         words = wrong[name]
     remedy = "Correct the accelerometer's axes and signs: at rest it shows +9.81 on the axis that points up."
     return (SensorCheck("accelerometer", False, v.given.left, v.best.left, f"{words}.", remedy, quantity),)
+
+
+def _large_bias(verdicts: Mapping[str, ForceVerdict]) -> tuple[str, str]:
+    """Words and advice about a bias that an accelerometer may have, but that may as well be something else."""
+    bias = np.median([v.given.bias for v in verdicts.values()], axis=0)
+    stds = np.median([v.given.bias_std for v in verdicts.values()], axis=0)
+    bias = np.where(stds < 0.2 * _LARGE_BIAS, bias, 0.0)
+    size = float(np.linalg.norm(bias))
+    if size < _LARGE_BIAS:
+        return "", ""
+    words = (
+        f"its bias is {size:.2f} m/s^2; if its axes are turned against the gyroscope's by "
+        f"{np.rad2deg(size / GRAVITY):.1f} deg it looks the same, and all cameras are turned by that."
+    )
+    return words, "Calibrate it at rest, in six positions."
 
 
 def _what_is_wrong(v: ForceVerdict) -> str:
