@@ -225,6 +225,8 @@ FAULTS: dict[str, tuple[str, Callable[[Faulty], None]]] = {
     "IMU at 10 Hz": ("", thinned("imu.csv", 10)),
     "IMU stamps of another year": ("", stamps_of("imu.csv", late(4e7))),
     "IMU stamps twice each": ("", stamps_of("imu.csv", lambda s: s[np.arange(len(s)) // 2 * 2])),
+    "IMU stamps in bunches of 0.2 s": ("imu", stamps_of(
+        "imu.csv", lambda s: s[np.arange(len(s)) // 20 * 20] + np.arange(len(s)) % 20 * 100_000)),
     "IMU rows that are no numbers": ("", not_numbers("imu.csv", 70)),
     "GNSS rows that are no numbers": ("", not_numbers("gnss.csv", 7)),
     "GNSS stamps in whole seconds": ("", stamps_of("gnss.csv", rounded(1.0))),

@@ -101,6 +101,12 @@ def test_dead_axes_are_named_and_those_that_stand_still_for_a_while_bridged() ->
     assert not any("repeats" in c.hypothesis for c in vet_samples(coarse).checks)
 
 
+def test_stamps_in_bunches_are_no_gaps_to_bridge() -> None:
+    t = imu().timestamps_ns
+    bunched = t[np.arange(len(t)) // 20 * 20] + np.arange(len(t)) % 20 * 100_000
+    assert "come in bunches" in wrong(vet_samples(replace(imu(), timestamps_ns=bunched)).checks)["imu"]
+
+
 def test_an_axis_a_bias_or_a_delay_of_the_accelerometer_is_named() -> None:
     assert "y axis shows 0.0" in forces(lambda a: with_axis(a, 1, noise(0.02)))
     assert "y axis shows 1.9" in forces(lambda a: a * [1.0, 2.0, 1.0])
