@@ -3,6 +3,7 @@ without and with cross-camera association.
 
     python benchmarks/calibrate.py [--peers] [RECORDING TRUTH | PRESET]...
     python benchmarks/calibrate.py --nees [--keep FOLDER] [NAME]...
+    python benchmarks/calibrate.py --checks RECORDING...
 
 Without arguments: `harbour_a` and `kitti_03_split` in RIGWAKE_DATA, or in ../shared/data beside the project, and the
 presets `demo` and `thesis_lively`, which are rendered first. --peers: pycolmap too, see `colmap_rig.py` (some ten
@@ -15,6 +16,9 @@ before the bundle adjustment, so it has no figures of its own.
 rough water, with RTK, a receiver of a metre whose error lasts, and none; NEES per degree of freedom of every camera in
 the frame of the IMU, its mean and its largest. 1 is expected. Ends with exit code 1 if the mean is not in 0.6-1.6 or
 a camera is above 3. --keep: recordings and calibrations stay in FOLDER, and what is there is taken again.
+
+--checks: what comparing the sensors costs, in a calibration of each recording. Cameras' coarse turns are not counted:
+they are what tracking starts from, compared or not. Ends with exit code 1 above 10 %.
 """
 
 import os
@@ -22,7 +26,11 @@ import resource
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import yaml
 
@@ -35,6 +43,7 @@ from rigwake.handeye.handeye_problem import HandeyeOptions
 from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.odometry.metric import metric_start
 from rigwake.odometry.thesis_odometry import estimate_thesis
+from rigwake.pipeline import calibration_run, sensor_checks, vetted_rig
 from rigwake.pipeline.calibration_run import calibrate
 from rigwake.pipeline.camera_stage import tracks_file
 from rigwake.readers.open import open_recording
@@ -48,10 +57,14 @@ METHODS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("lenses held", ("intrinsics=fixed",)),
     ("no cross-camera association", ("adjustment.cross_camera=false",)),
 )
-WITHOUT_CHECKS = (
-    "sensors believed",
-    ("sensor_checks=false",),
-)  # from images again: their cost is in every stage
+CHECKS = (  # where sensors are compared, all in the process that `calibrate` runs in
+    (calibration_run, "vet_imu"),
+    (vetted_rig, "mend_lenses"),
+    (vetted_rig, "vet_sensors"),
+    (calibration_run, "knocks_inside"),
+    (sensor_checks, "visual_rotations"),
+)
+MOST_COST = 0.10
 PEER_RATE_HZ = 1.0  # all pairs of images are matched: twice the rate takes four times as long
 SMALL = 0.75  # of the presets' pictures
 # name -> preset, significant wave height in metres, receiver
@@ -126,8 +139,8 @@ def pycolmap_rig(recording: Path) -> Calibration | str:
 
 def calibrated(
     name: str, truth: Rig, method: str, settings: tuple[str, ...], out: Path, *, resumed: bool, given: Path
-) -> float:
-    """Prints a row of the table; CPU seconds."""
+) -> None:
+    """Prints a row of the table."""
     wall, cpu = time.perf_counter(), cpu_s()
     try:
         found: Calibration | str = calibrate(
@@ -138,32 +151,62 @@ def calibrated(
     wall, cpu = time.perf_counter() - wall, cpu_s() - cpu
     tracked = " after tracking" if resumed else f", peak {peak_gb():.2f} GB"
     row(name, method, found, truth, f"{cpu:.0f} CPU s, {wall:.0f} s{tracked}")
-    return cpu
 
 
 def compare(recording: Path, truth_file: Path, peers: bool) -> None:
     name, truth = recording.stem, read_true_rig(truth_file)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
-        used = {}
         for method, settings in METHODS:
-            used[method] = calibrated(
-                name, truth, method, settings, out, resumed=bool(settings), given=recording
-            )
-        checked = used[METHODS[0][0]]
-        unchecked = calibrated(name, truth, *WITHOUT_CHECKS, out / "believed", resumed=False, given=recording)
+            calibrated(name, truth, method, settings, out, resumed=bool(settings), given=recording)
         row(name, "hand-eye only", load_calibration(out / "initial_rig.yaml"), truth, "")
         cpu = cpu_s()
         found = thesis_pipeline(recording, out)
         row(name, "thesis pipeline", found, truth, f"{cpu_s() - cpu:.0f} CPU s after tracking")
-        print(
-            f"\ncomparing the sensors took {100 * (checked / unchecked - 1):+.0f} % of {unchecked:.0f} CPU s\n"
-        )
     if peers:
         wall, cpu = time.perf_counter(), cpu_s()
         found = pycolmap_rig(recording)
         wall, cpu = time.perf_counter() - wall, cpu_s() - cpu
         row(name, f"pycolmap, {PEER_RATE_HZ:g} Hz", found, truth, f"{cpu:.0f} CPU s, {wall:.0f} s")
+
+
+def cost_of_checks(recordings: list[Path]) -> int:
+    """One row per recording: CPU seconds of every comparison, and their part of the run."""
+    print("| recording | comparing the sensors | of it | the run |\n|---|---|---|---|")
+    too_much = False
+    for recording in recordings:
+        spent: dict[str, float] = {name: 0.0 for _, name in CHECKS}
+        with ExitStack() as patches, tempfile.TemporaryDirectory() as out:
+            for module, name in CHECKS:
+                patches.enter_context(
+                    mock.patch.object(module, name, timed(getattr(module, name), name, spent))
+                )
+            started = cpu_s()
+            calibrate(recording, out, load_config(None, ()))
+            whole = cpu_s() - started
+        spent["vet_imu"] -= spent.pop("visual_rotations")
+        used = sum(spent.values())
+        too_much |= used > MOST_COST * (whole - used)
+        words = ", ".join(f"{name} {seconds:.1f}" for name, seconds in spent.items())
+        added = 100 * used / (whole - used)
+        print(
+            f"| {recording.stem} | {used:.1f} CPU s, {added:+.1f} % | {words} | {whole:.0f} CPU s |",
+            flush=True,
+        )
+    return int(too_much)
+
+
+def timed(call: Callable[..., Any], name: str, spent: dict[str, float]) -> Callable[..., Any]:
+    """The same, adding its CPU seconds to those spent under `name`."""
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        started = time.process_time()
+        try:
+            return call(*arguments, **options)
+        finally:
+            spent[name] += time.process_time() - started
+
+    return counted
 
 
 def compare_preset(preset: str, peers: bool) -> None:
@@ -221,6 +264,9 @@ def honesty(names: list[str], folder: Path) -> int:
 
 def main() -> None:
     given = [argument for argument in sys.argv[1:] if argument != "--peers"]
+    if "--checks" in given:
+        given.remove("--checks")
+        sys.exit(cost_of_checks([Path(argument) for argument in given]))
     if "--nees" in given:
         given.remove("--nees")
         with tempfile.TemporaryDirectory() as folder:

@@ -1,24 +1,24 @@
 """One thing wrong in a rendered recording at a time, and what `calibrate` makes of it.
 
-    python benchmarks/faults.py RECORDING TRUTH [--cameras front,left] [--only WORD]... [--pairs]
+    python benchmarks/faults.py RECORDING TRUTH [--cameras front,left] [--only WORD]... [--pairs] [--rows FILE]
 
 RECORDING: a folder as `rigwake simulate demo -o FOLDER` writes it, with its TRUTH. Each fault is written into a copy of
 the recording (pictures that stay as they are are linked), calibrated, and judged: refused with the sensor named,
 partial (the sensor left out and named), repaired, or calibrated; and, of what was calibrated, the errors against the
 truth and the largest NEES of six. A result is sound if every camera is within 3 sigmas (NEES below 27) or the faulty
 sensor was named; `SILENT` marks what is neither. What a camera stage made of the same pictures, lens and IMU is taken
-again from `--cache` (a temporary folder by default), so a fault of GNSS costs only the rig. Ends with exit code 1 if
-anything was silently wrong.
+again from `--cache` (a temporary folder by default), so a fault of GNSS costs only the rig. `--rows`: rows are added to
+FILE as they come, and those that stand there are not run again. Ends with exit code 1 if anything was silently wrong.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
+import resource
 import shutil
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -28,27 +28,37 @@ import numpy as np
 from recording_faults import (
     Faulty,
     all_lenses,
+    breathing,
     clipped,
+    cropped,
     doubled,
     drifting,
     drifting_fixes,
     exchanged,
     frozen,
     gnss,
+    gyroscope_late,
+    halved,
     held,
     held_fixes,
+    images_lost,
     imu,
     jittering,
     jumping,
     knocked,
     lagging,
     late,
+    limited,
     metre_grade,
     noisy,
+    not_numbers,
     offset,
     order,
     outliers,
+    permuted,
+    quarter_turned,
     refocused,
+    rounded,
     scale,
     sent_again,
     shift,
@@ -57,17 +67,27 @@ from recording_faults import (
     stamps_of,
     still_axis,
     stuck,
+    thinned,
+    turned_against,
     without_rows,
+    zoomed_and_exchanged,
 )
 from rigwake.config import load_config
 from rigwake.errors import RigwakeError
 from rigwake.evaluation.rig_errors import evaluate_calibration
 from rigwake.pipeline.calibration_run import calibrate
 from rigwake.pipeline.camera_key import camera_key
-from rigwake.pipeline.camera_processes import Finished, Progress, process_cameras
-from rigwake.pipeline.camera_stage import CameraJob, CameraOutcome, load_outcome, stage_files
+from rigwake.pipeline.camera_processes import Finished, Progress
+from rigwake.pipeline.camera_stage import (
+    CameraJob,
+    CameraOutcome,
+    load_outcome,
+    process_camera,
+    stage_files,
+)
 from rigwake.readers.truth_files import read_true_rig, rig_in_frame
 
+WORDS = 200  # letters of what was said, at most
 NEES_LIMIT = 27.0  # of six degrees of freedom: the square of 3 sigmas along every axis at once
 
 
@@ -95,9 +115,9 @@ class CachedCameras:
                     shutil.copy(file, copy)
             finished(outcome)
 
-        fresh = [job for job in jobs if job.stream.name not in known]
-        if fresh:
-            process_cameras(fresh, workers, progress, keep)
+        for job in jobs:  # in this process: what was compiled for one row serves the next
+            if job.stream.name not in known:
+                keep(process_camera(job, lambda stage, fraction: None))
         return [load_outcome(job.out, job.stream.name) for job in jobs]
 
     def _key(self, job: CameraJob) -> str:
@@ -196,6 +216,31 @@ FAULTS: dict[str, tuple[str, Callable[[Faulty], None]]] = {
     "stamps of one camera in steps of 50 ms": ("", lambda f: f.restamp(
         f.cameras[0], lambda s: s // 50_000_000 * 50_000_000)),
     "IMU low-pass filtered over 0.1 s": ("", lambda f: f.edit("imu.csv", smoothed)),
+    "accelerometer 0.1 s behind the gyroscope": ("accelerometer", lagging(slice(3, 6), 0.1)),
+    "gyroscope alone low-pass filtered, 0.1 s late": ("gyroscope", gyroscope_late),
+    "gyroscope in deg/s, x and y exchanged": (
+        "gyroscope", imu(lambda v: v.__setitem__((slice(None), slice(0, 3)), np.rad2deg(v[:, [1, 0, 2]])))),
+    "gyroscope turned by 4 deg against the accelerometer": ("gyroscope", imu(turned_against(slice(0, 3), 4.0))),
+    "gyroscope range of 0.25 rad/s": ("gyroscope", imu(limited(0.25))),
+    "IMU at 10 Hz": ("", thinned("imu.csv", 10)),
+    "IMU stamps of another year": ("", stamps_of("imu.csv", late(4e7))),
+    "IMU stamps twice each": ("", stamps_of("imu.csv", lambda s: s[np.arange(len(s)) // 2 * 2])),
+    "IMU stamps in bunches of 0.2 s": ("imu", stamps_of(
+        "imu.csv", lambda s: s[np.arange(len(s)) // 20 * 20] + np.arange(len(s)) % 20 * 100_000)),
+    "IMU rows that are no numbers": ("", not_numbers("imu.csv", 70)),
+    "GNSS rows that are no numbers": ("", not_numbers("gnss.csv", 7)),
+    "GNSS stamps in whole seconds": ("", stamps_of("gnss.csv", rounded(1.0))),
+    "GNSS heights of the geoid": ("", gnss(offset([2], [40.0]))),
+    "GNSS position of a base 30 m off": ("", gnss(shift(slice(None), (25.0, -16.0)))),
+    "stamps of one camera in steps of 0.1 s": ("", lambda f: f.restamp(f.cameras[0], rounded(0.1))),
+    "every second picture of one camera lost": ("", images_lost),
+    "lens files of two cameras exchanged": ("camera", zoomed_and_exchanged),
+    "pictures of one camera halved against its lens": (
+        "front", lambda f: f.change_images(f.cameras[0], halved)),
+    "pictures of one camera cropped": ("camera", cropped),
+    "pictures of one camera a quarter turned": ("camera", quarter_turned),
+    "pictures of one camera exchanged with their neighbours": ("camera", permuted),
+    "focal length of one camera grows by 1 %": ("camera", breathing),
 }  # fmt: skip
 PAIRS = (
     ("accelerometer in g", "GNSS 1 s late"),
@@ -208,7 +253,7 @@ PAIRS = (
 
 def judged(recording: Path, truth: Path, named: list[str], cache: Path) -> str:
     """One row: what came of it, whether the faulty sensor was named, errors, NEES, and whether that is sound."""
-    started = time.process_time()
+    started = cpu_s()
     with tempfile.TemporaryDirectory() as out:
         try:
             cameras = CachedCameras(recording, cache)
@@ -217,7 +262,8 @@ def judged(recording: Path, truth: Path, named: list[str], cache: Path) -> str:
             words = str(error).lower()
             good = any(name in words for name in named)  # the first that was found ends the run
             verdict = "refused" if good else "refused, not named"
-            return f"{verdict} | {'yes' if good else 'NO'} | – | – | {'sound' if good else 'WRONG'} | {words[:110]}"
+            sound = f"{'sound' if good else 'WRONG'} ({cpu_s() - started:.0f} s)"
+            return f"{verdict} | {'yes' if good else 'NO'} | – | – | {sound} | {words[:WORDS]}"
         noted = [c for c in run.sensor_checks if c.hypothesis]
         words = " ".join([*(c.sentence for c in noted), *run.failed, *run.notes]).lower()
         words = words.replace("accelerations in", "accelerometer in")
@@ -236,9 +282,14 @@ def judged(recording: Path, truth: Path, named: list[str], cache: Path) -> str:
         else "calibrated"
     )
     sound = "sound" if nees < NEES_LIMIT else "named" if good and named else "SILENT"
-    seconds = time.process_time() - started
-    figures = f"{turn:.3f} / {100 * shift_m:.1f} | {nees:.1f} | {sound} ({seconds:.0f} s)"
-    return f"{what} | {'yes' if good else 'NO'} | {figures} | {words[:110]}"
+    figures = f"{turn:.3f} / {100 * shift_m:.1f} | {nees:.1f} | {sound} ({cpu_s() - started:.0f} s)"
+    return f"{what} | {'yes' if good else 'NO'} | {figures} | {words[:WORDS]}"
+
+
+def cpu_s() -> float:
+    """Of this process and of those that it started."""
+    used = [resource.getrusage(whose) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(u.ru_utime + u.ru_stime for u in used)
 
 
 def main() -> int:
@@ -251,29 +302,46 @@ def main() -> int:
     parser.add_argument("--only", action="append", default=[])
     parser.add_argument("--pairs", action="store_true")
     parser.add_argument("--cache", type=Path)
+    parser.add_argument("--rows", type=Path)
     chosen = parser.parse_args()
-    cases = [((name,), [name]) for name in FAULTS if not chosen.only or any(w in name for w in chosen.only)]
+    cases = [(name,) for name in FAULTS if not chosen.only or any(w in name for w in chosen.only)]
     if chosen.pairs:
-        cases = [(pair, list(pair)) for pair in PAIRS]
+        cases = list(PAIRS)
+    known = {} if chosen.rows is None or not chosen.rows.exists() else rows_of(chosen.rows.read_text())
     print(
         "| wrong | outcome | named | worst deg / cm | largest NEES | |\n|---|---|---|---|---|---|", flush=True
     )
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         cache = chosen.cache or Path(folder) / "cache"
-        for number, (faults, names) in enumerate(cases):
-            spoilt = Path(folder) / f"recording_{number}"
-            faulty = Faulty(chosen.recording.resolve(), spoilt, chosen.cameras.split(","))
-            for name in faults:
-                FAULTS[name][1](faulty)
+        for number, faults in enumerate(cases):
             named = [FAULTS[name][0] for name in faults if FAULTS[name][0]]
-            rows.append((named, judged(faulty.folder, chosen.truth, named, cache)))
-            print(f"| {' + '.join(names)} | {rows[-1][1]} |", flush=True)
-            shutil.rmtree(spoilt)
+            words = " + ".join(faults)
+            if words not in known:
+                faulty = Faulty(
+                    chosen.recording.resolve(), Path(folder) / str(number), chosen.cameras.split(",")
+                )
+                for name in faults:
+                    FAULTS[name][1](faulty)
+                known[words] = judged(faulty.folder, chosen.truth, named, cache)
+                if chosen.rows is not None:
+                    with chosen.rows.open("a") as file:
+                        file.write(f"| {words} | {known[words]} |\n")
+                shutil.rmtree(faulty.folder)
+            rows.append((named, known[words]))
+            print(f"| {words} | {known[words]} |", flush=True)
     wrong = sum("SILENT" in row for _, row in rows)
     rightly = [row.split(" | ")[1] == "yes" for named, row in rows if named]
     print(f"\nsilently wrong: {wrong} of {len(rows)}; named rightly: {sum(rightly)} of {len(rightly)}")
     return int(wrong > 0)
+
+
+def rows_of(text: str) -> dict[str, str]:
+    """Rows of a former run by what was wrong."""
+    lines = [
+        line.removeprefix("| ").removesuffix(" |") for line in text.splitlines() if line.startswith("| ")
+    ]
+    return dict(line.split(" | ", 1) for line in lines)
 
 
 if __name__ == "__main__":

@@ -315,6 +315,122 @@ def noisy(columns: slice, sigma: float) -> Callable[[Table], None]:
     return change
 
 
+def rounded(step_s: float) -> Callable[[NDArray[np.int64]], NDArray[np.int64]]:
+    """Stamps of a clock with coarse steps."""
+    step = round(step_s * 1e9)
+    return lambda s: s // step * step
+
+
+def images_lost(f: Faulty) -> None:
+    """Every second picture of one camera, and its stamp."""
+    path = f.folder / f.cameras[0] / "timestamps.csv"
+    head, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([head, *rows[::2]]) + "\n")
+    for image in f.images(f.cameras[0])[1::2]:
+        image.unlink()
+
+
+def zoomed_and_exchanged(f: Faulty) -> None:
+    """One camera has a lens 6 % longer than another, and each has the lens file of the other."""
+    zoomed(f, 1.06, lambda n: np.full(n, 1.06))
+    f.lens(f.cameras[1], 1.06)
+
+
+def breathing(f: Faulty) -> None:
+    """Autofocus: the focal length of one camera grows steadily, by 1 % in all."""
+    zoomed(f, 1.01, lambda n: np.linspace(1.0, 1.01, n))
+
+
+def zoomed(f: Faulty, most: float, by_image: Callable[[int], Table]) -> None:
+    """Pictures of one camera larger about its principal point, by a factor each."""
+    camera = f.cameras[0]
+    p = yaml.safe_load((f.folder / "rig.yaml").read_text())["cameras"][camera]["camera"]["params"]
+    factors = iter(by_image(len(f.images(camera))))
+
+    def larger(picture: np.ndarray) -> np.ndarray:
+        z = float(next(factors))
+        matrix = np.array([[z, 0.0, (1 - z) * p["cx"]], [0.0, z, (1 - z) * p["cy"]]])
+        return cv2.warpAffine(picture, matrix, picture.shape[1::-1], flags=cv2.INTER_CUBIC)
+
+    f.change_images(camera, larger)
+
+
+def halved(picture: np.ndarray) -> np.ndarray:
+    return cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+
+
+def cropped(f: Faulty) -> None:
+    """48 columns cut off at the left of one camera's pictures; the lens file knows the new size, not the new centre."""
+    f.change_images(f.cameras[0], lambda p: p[:, 48:])
+    f.edit_rig(lambda rig: rig["cameras"][f.cameras[0]]["camera"].update(
+        width_px=rig["cameras"][f.cameras[0]]["camera"]["width_px"] - 48))  # fmt: skip
+
+
+def permuted(f: Faulty) -> None:
+    """Pictures of one camera exchanged with their neighbours now and then, under the stamps as they were."""
+    images = f.images(f.cameras[0])
+    for k in range(4, len(images) - 1, 9):
+        first, second = images[k].resolve(), images[k + 1].resolve()
+        images[k].unlink()
+        images[k + 1].unlink()
+        os.symlink(second, images[k])
+        os.symlink(first, images[k + 1])
+
+
+def quarter_turned(f: Faulty) -> None:
+    """Pictures of one camera turned by 90 degrees, and width and height in the lens file exchanged too."""
+    f.change_images(f.cameras[0], lambda p: cv2.rotate(p, cv2.ROTATE_90_CLOCKWISE))
+
+    def change(rig: dict) -> None:
+        lens = rig["cameras"][f.cameras[0]]["camera"]
+        lens["width_px"], lens["height_px"] = lens["height_px"], lens["width_px"]
+
+    f.edit_rig(change)
+
+
+def not_numbers(file: str, every: int) -> Callable[[Faulty], None]:
+    """Rows whose values are not a number."""
+
+    def change(stamps: NDArray[np.int64], v: Table) -> None:
+        v[every::every] = np.nan
+
+    return lambda f: f.edit(file, change)
+
+
+def thinned(file: str, every: int) -> Callable[[Faulty], None]:
+    return lambda f: f.edit(file, lambda stamps, v: (stamps[::every], v[::every]))
+
+
+def limited(most: float) -> Callable[[Table], None]:
+    """A gyroscope whose range ends at `most` rad/s."""
+
+    def change(v: Table) -> None:
+        np.clip(v[:, :3], -most, most, out=v[:, :3])
+
+    return change
+
+
+def turned_against(columns: slice, deg: float) -> Callable[[Table], None]:
+    """Three columns turned about an axis in the deck: gyroscope and accelerometer are not mounted alike."""
+    turn = cv2.Rodrigues(np.deg2rad(deg) * np.array([0.8, 0.6, 0.0]))[0]
+
+    def change(v: Table) -> None:
+        v[:, columns] = v[:, columns] @ turn.T
+
+    return change
+
+
+def gyroscope_late(f: Faulty) -> None:
+    """The gyroscope alone goes through a filter that delays it by 0.1 s; the accelerometer does not."""
+
+    def change(stamps: NDArray[np.int64], v: Table) -> None:
+        n = max(2, round(0.2e9 / float(np.median(np.diff(stamps)))))
+        sums = np.cumsum(np.concatenate([np.repeat(v[:1, :3], n, axis=0), v[:, :3]]), axis=0)
+        v[:, :3] = (sums[n:] - sums[:-n]) / n
+
+    f.edit("imu.csv", change)
+
+
 def drifting_fixes(v: Table) -> None:
     """Fixes that run away to the north by 0.2 m per second."""
     v[:, 0] += np.arange(len(v)) * 0.2 * 0.2 / 111_320.0

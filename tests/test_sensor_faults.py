@@ -7,19 +7,25 @@ import numpy as np
 import pytest
 
 from rigwake.geometry import so3
+from rigwake.geometry.se3 import SE3
 from rigwake.pipeline import sensor_checks
+from rigwake.plausibility import force_fit, turn_checks
 from rigwake.plausibility.coarse_turns import vet_turns
 from rigwake.plausibility.force_checks import check_forces, compare_forces
+from rigwake.plausibility.force_fit import ForceEquations
 from rigwake.plausibility.gyro_axes import check_axes
 from rigwake.plausibility.imu_samples import vet_samples
-from rigwake.plausibility.lens_fit import LensFit
+from rigwake.plausibility.jitter_checks import check_jitter
+from rigwake.plausibility.lens_checks import check_lenses
+from rigwake.plausibility.lens_fit import LensFit, fit_lens
 from rigwake.plausibility.receiver_checks import VettedReceiver
 from rigwake.plausibility.receiver_fit import ReceiverFit
-from rigwake.plausibility.receiver_repeats import repeated_rows
+from rigwake.plausibility.receiver_repeats import repeated_rows, with_rounding
 from rigwake.plausibility.receiver_wrongs import rows_of_one_level
 from rigwake.plausibility.stamp_rates import rate_of_stamps
-from rigwake.plausibility.turn_checks import check_mounts
+from rigwake.plausibility.turn_checks import check_mounts, mount_change
 from rigwake.recording import GnssStream, ImuStream
+from rigwake.tracking.camera_rotations import _from_the_middle
 from rigwake.tracking.front_ends import _TrackingRun
 from test_plausibility import drifting, fits, gnss, imu, paths, vetted, world, wrong
 
@@ -95,11 +101,25 @@ def test_dead_axes_are_named_and_those_that_stand_still_for_a_while_bridged() ->
     assert not any("repeats" in c.hypothesis for c in vet_samples(coarse).checks)
 
 
+def test_stamps_in_bunches_are_no_gaps_to_bridge() -> None:
+    t = imu().timestamps_ns
+    bunched = t[np.arange(len(t)) // 20 * 20] + np.arange(len(t)) % 20 * 100_000
+    assert "come in bunches" in wrong(vet_samples(replace(imu(), timestamps_ns=bunched)).checks)["imu"]
+
+
 def test_an_axis_a_bias_or_a_delay_of_the_accelerometer_is_named() -> None:
     assert "y axis shows 0.0" in forces(lambda a: with_axis(a, 1, noise(0.02)))
     assert "y axis shows 1.9" in forces(lambda a: a * [1.0, 2.0, 1.0])
     assert "its bias is (1.9" in forces(lambda a: a + np.array([2.0, 0.0, 0.0]))
     assert "0.3 s too late" in forces(lambda a: np.concatenate([a[:30], a[:-30]]))
+    assert "0.1 s too early" in forces(lambda a: np.concatenate([a[10:], a[-10:]]))
+    biased = check_forces(
+        compare_forces(paths(), replace(imu(), accel=imu().accel + np.array([0.9, 0.0, 0.0])), fits(imu()))
+    )
+    assert [c.agrees for c in biased] == [True]
+    assert "its bias is 0." in biased[0].hypothesis
+    small = replace(imu(), accel=np.concatenate([imu().accel[:2], imu().accel[:-2]]))
+    assert not wrong(check_forces(compare_forces(paths(), small, fits(imu()))))
 
 
 def with_heights(change: Callable[[np.ndarray], np.ndarray]) -> VettedReceiver:
@@ -172,6 +192,55 @@ def test_coarse_digits_of_a_slow_vessel_are_no_fixes_sent_again() -> None:
     assert repeated_rows(replace(slow, position_enu=again)).mean() > 0.7
 
 
+def test_rounded_fixes_have_the_noise_of_their_last_digit() -> None:
+    given = gnss()
+    assert with_rounding(given)[1] == 0
+    coarse = replace(given, position_enu=np.round(given.position_enu / [0.6, 1.1, 0.1]) * [0.6, 1.1, 0.1])
+    found, digit = with_rounding(coarse)
+    assert digit == pytest.approx(1.1)
+    wider = found.covariances - given.covariances
+    assert wider[0] == pytest.approx(np.diag([1.1**2 / 12, 1.1**2 / 12, 0.0]))
+    assert any("rounded to 1.10 m" in c.hypothesis and c.agrees for c in vetted(coarse).checks)
+
+
+@pytest.mark.parametrize("rate_hz", [6.0, 30.0])
+def test_coarse_turns_last_however_many_pictures_there_are(rate_hz: float) -> None:
+    stamps = np.round(np.arange(1000) * 1e9 / rate_hz).astype(np.int64)
+    chosen = _from_the_middle(stamps, 150)
+    assert len(chosen) == 150
+    assert (stamps[chosen[-1]] - stamps[chosen[0]]) * 1e-9 > 14
+    assert 0 <= chosen[0] + chosen[-1] - 999 + 3 <= 6
+    assert len(_from_the_middle(stamps[:40], 150)) == (40 if rate_hz == 6.0 else 14)
+
+
+def test_the_time_of_a_change_is_found_in_long_recordings_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    path = paths()["front"]
+    rotation = path.world_from_body.rotation.copy()
+    rotation[len(path) // 3 :] = rotation[len(path) // 3 :] @ so3.exp(np.array([0.0, 0.0, 0.9]))
+    segments = (np.arange(len(path)) >= len(path) // 3).astype(
+        np.int64
+    )  # lost in between: no stride shows the knock
+    changed = replace(
+        path, world_from_body=SE3(rotation, path.world_from_body.translation), segment_ids=segments
+    )
+    fit = fits(imu(), {"front": changed})["front"]
+    fine = mount_change(fit)
+    monkeypatch.setattr(turn_checks, "_MOST_SPLITS", 5)
+    coarse = mount_change(fit)
+    assert fine is not None
+    assert coarse is not None
+    assert coarse.at_ns == fine.at_ns
+
+
+def test_forces_of_long_recordings_are_sampled(monkeypatch: pytest.MonkeyPatch) -> None:
+    fit = fits(imu())["front"]
+    whole = ForceEquations(paths()["front"], imu(), fit).solve(np.eye(3))
+    monkeypatch.setattr(force_fit, "_MOST", 40)
+    some = ForceEquations(paths()["front"], imu(), fit)
+    assert len(some.force) == 40
+    assert some.solve(np.eye(3)).scale == pytest.approx(whole.scale, rel=0.05)
+
+
 def test_a_receiver_that_never_moves_is_left_out() -> None:
     found = vetted(replace(gnss(), position_enu=np.zeros_like(gnss().position_enu)))
     assert found.gnss is None
@@ -201,6 +270,50 @@ def test_pictures_shown_again_later_are_repeated_ones() -> None:
     assert [run.judge(p) for p in (*pictures, *pictures[1:3], pictures[3])] == ["usable"] * 4 + [
         "repeated"
     ] * 3
+
+
+@pytest.mark.parametrize(("size_s", "agrees"), [(0.0, True), (0.008, True), (0.03, False)])
+def test_stamps_that_jitter_are_named(size_s: float, agrees: bool) -> None:
+    front = paths()["front"]
+    off = np.random.default_rng(1).normal(0, size_s, len(front))
+    stamps = np.maximum.accumulate(front.timestamps_ns + np.round(off * 1e9).astype(np.int64))
+    shaken = {**paths(), "front": replace(front, timestamps_ns=stamps + np.arange(len(stamps)))}
+    checks = check_jitter(shaken, imu(), fits(imu(), shaken))
+    assert [c.sensor for c in checks] == (["camera front"] if size_s else [])
+    assert all(c.agrees == agrees and c.statistic == pytest.approx(size_s, rel=0.4) for c in checks)
+
+
+def test_stamps_of_all_cameras_in_steps_may_be_the_fault_of_the_imu() -> None:
+    coarse = {
+        n: replace(p, timestamps_ns=p.timestamps_ns // 70_000_000 * 70_000_000) for n, p in paths().items()
+    }
+    checks = check_jitter(coarse, imu(), fits(imu(), coarse))
+    assert [c.sensor for c in checks] == ["imu"]
+    assert not checks[0].agrees
+
+
+def test_a_camera_that_the_gyroscope_explains_less_than_the_others_is_odd() -> None:
+    good = fits(imu())["front"]
+    rng = np.random.default_rng(0)
+    size = 0.25 * np.linalg.norm(good.camera_turns, axis=1).mean()
+    poor = replace(good, residuals=rng.normal(0, size, good.residuals.shape))
+    assert 0.15 < poor.unexplained < 0.5
+    assert set(sensor_checks._odd_ones({"front": poor, "left": good, "right": good})) == {"front"}
+    assert not sensor_checks._odd_ones({"front": poor, "left": poor})
+    assert not sensor_checks._odd_ones({"front": good, "left": good})
+
+
+def test_a_focal_length_that_grows_is_named() -> None:
+    seen, lens = world().tracks["front"], world().recording.cameras["front"].model
+    assert lens is not None
+    centre = lens.project(np.array([[0.0, 0.0, 1.0]]))[0][0]
+    when = seen.frame_indices / seen.frame_indices.max()
+    breathing = replace(seen, pixels=centre + (seen.pixels - centre) * (1 + 0.03 * when)[:, None])
+    for tracks, agrees in ((seen, True), (breathing, False)):
+        fitted = {"front": replace(fit_lens(seen, lens, paths()["front"]), refined_rms_px=0.05)}
+        checks = check_lenses(fitted, {"front": tracks}, {"front": lens}, paths())
+        assert checks[0].agrees == agrees
+    assert "its focal length changes" in checks[0].hypothesis
 
 
 def test_a_rate_is_not_looked_for_where_nothing_turns() -> None:

@@ -15,13 +15,14 @@ from rigwake.plausibility.force_checks import ForceVerdict, check_forces, compar
 from rigwake.plausibility.force_fit import ForceFit, longest_segment
 from rigwake.plausibility.gyro_axes import check_axes
 from rigwake.plausibility.imu_samples import vet_samples
+from rigwake.plausibility.jitter_checks import check_jitter
 from rigwake.plausibility.lens_checks import check_lenses, fit_lenses, is_off
 from rigwake.plausibility.lens_fit import LensFit
 from rigwake.plausibility.picture_checks import check_pictures
 from rigwake.plausibility.receiver_checks import vet_receiver
 from rigwake.plausibility.receiver_fit import level_path
 from rigwake.plausibility.stamp_rates import rate_of_stamps, turns_of, varies, with_rate
-from rigwake.plausibility.turn_checks import check_clocks, check_mounts, check_scale
+from rigwake.plausibility.turn_checks import EXPLAINED, check_clocks, check_mounts, check_scale
 from rigwake.plausibility.turn_fit import TurnFit, camera_as_gyroscope, fit_turns
 from rigwake.plausibility.values import SensorCheck, disagreeing, refuse
 from rigwake.recording import CameraStream, GnssStream, ImuStream
@@ -30,6 +31,7 @@ from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
 _UNRELATED = 0.5  # of a camera's turns that the gyroscope does not explain
+_WELL_EXPLAINED = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +135,7 @@ def compare_sensors(
     checks += found
     focal_stds = {name: float(np.sqrt(max(fit.covariance[0, 0], 0.0))) for name, fit in lenses.items()}
     fits, imu, found = _scaled(trajectories, fits, imu, sound, focal_stds, repair)
-    checks += [*found, *check_clocks(fits)]
+    checks += [*found, *check_clocks(fits), *check_jitter(trajectories, imu, fits)]
     # a wrong axis of the gyroscope looks like a mount of every camera that moves; a wrong focal length looks like a
     # wrong axis: it scales turns about two axes of the camera, not those about the optical axis
     checks += check_axes({n: f for n, f in fits.items() if n in sound or n not in lenses}) or check_mounts(
@@ -204,33 +206,49 @@ def _fit_all(
         fits[name] = fit
         if fit.unexplained > _UNRELATED:
             unrelated[name] = fit.unexplained
+    unrelated |= _odd_ones(fits)
     quantity = "part of its turns that the gyroscope does not explain"
     if unrelated and not fits.keys() - unrelated.keys() and len(unrelated) > 1:
         worst = float(np.median(list(unrelated.values())))
         words = f"it leaves {100 * worst:.0f} % of every camera's turns unexplained, at any mounting and time offset."
         remedy = "Check that the IMU belongs to this recording, its axes, unit and stamps."
-        rates = [r for name in unrelated if (r := _rate(imu, trajectories[name])) is not None]
+        rates = [
+            r for name in unrelated if (r := _rate(imu, trajectories[name], unrelated[name])) is not None
+        ]
         if len(rates) * 2 > len(unrelated):
             words += f" They agree if its stamps run {1 / float(np.median(rates)):.3f} times as fast as the cameras'."
         return {}, [SensorCheck("gyroscope", False, worst, _UNRELATED, words, remedy, quantity)]
     checks = []
     for name, figure in unrelated.items():
         words = f"the gyroscope explains only {100 * (1 - figure):.0f} % of its turns, at any mounting and time offset."
-        if (rate := _rate(imu, trajectories[name])) is not None:
+        if (rate := _rate(imu, trajectories[name], figure)) is not None:
             words += f" It agrees if its stamps run {rate:.3f} times as fast as the IMU's."
-        remedy = "Check that its pictures belong to this recording, and their stamps."
+        remedy = (
+            "Check that its pictures belong to this recording, are neither turned nor cut, and their stamps."
+        )
         checks.append(SensorCheck(f"camera {name}", False, figure, _UNRELATED, words, remedy, quantity))
     return {n: f for n, f in fits.items() if n not in unrelated}, checks
 
 
-def _rate(imu: ImuStream, trajectory: Trajectory) -> float | None:
+def _odd_ones(fits: Mapping[str, TurnFit]) -> dict[str, float]:
+    """Cameras a good part of whose turns the gyroscope does not explain although it explains all of the others'."""
+    left = {name: fit.unexplained for name, fit in fits.items()}
+    others = {name: [x for n, x in left.items() if n != name] for name in left}
+    return {
+        name: x
+        for name, x in left.items()
+        if x > EXPLAINED and others[name] and float(np.median(others[name])) < _WELL_EXPLAINED
+    }
+
+
+def _rate(imu: ImuStream, trajectory: Trajectory, unexplained: float) -> float | None:
     """Seconds of the camera per second of the IMU where that, and nothing else, makes their turns agree; else None."""
     rate = rate_of_stamps(imu, trajectory)
     try:
-        explained = rate is not None and fit_turns(trajectory, with_rate(imu, rate)).unexplained < 0.3
+        left = 1.0 if rate is None else fit_turns(trajectory, with_rate(imu, rate)).unexplained
     except RigwakeError:
         return None
-    return rate if explained else None
+    return rate if left < min(0.3, 0.5 * unexplained) else None
 
 
 def _scaled(

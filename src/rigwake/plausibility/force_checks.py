@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,10 +25,12 @@ _KNOWN_ROTATION = np.deg2rad(2.0)
 _CLEARLY_BETTER = 0.6
 _SIGN_SIGMAS = 6.0
 _GRAVITY_TOLERANCE = 0.12
+_LARGE_BIAS = 0.4  # m/s^2, worth a word
 MOST_BIAS = 1.5  # m/s^2; what the cheapest MEMS accelerometers have, uncalibrated, is below 1
 _LEAST_TOLD, _TOLD_STDS = 0.15, 4.0  # what an axis should show, m/s^2 and over what the others leave
 _LEAST_SLOPE, _MOST_SLOPE = 0.5, 1.6
 _WORTH_ASKING = 0.15  # of the accelerations: good recordings leave a tenth of that where they tell anything
+_DELAY_S, _DELAY_SIGMAS, _FITTING = 0.04, 8.0, 0.5
 _DELAYS_S = tuple(sign * s for s in (0.05, 0.1, 0.2, 0.3, 0.4, 0.6) for sign in (1.0, -1.0))
 
 
@@ -37,13 +39,14 @@ class ForceVerdict:
     """Of one camera: the fit as given, the best of all readings of the axes, and every axis against the others.
 
     delays: what is left, m/s^2, by seconds that the accelerometer is suspected to be behind the gyroscope; empty where
-    there was no need to ask.
+    there was no need to ask. delay: the same as an unknown of the fit, with its deviation; for small ones.
     """
 
     given: ForceFit
     best: ForceFit
     axes: tuple[AxisFit, ...] = ()
     delays: Mapping[float, float] = field(default_factory=dict)
+    delay: tuple[float, float] = (0.0, np.inf)
 
 
 def compare_forces(
@@ -63,20 +66,9 @@ def compare_forces(
         alone = tuple(equations.alone(axis) for axis in range(3))
         delays = {}
         if min(best.left, *(axis.left for axis in alone)) > _WORTH_ASKING * best.moved:
-            delays = {s: _left(trajectories[name], _ahead(imu, s), fit) for s in _DELAYS_S}
-        found[name] = ForceVerdict(fits[0], best, alone, delays)
+            delays = {s: equations.ahead(s).solve(np.eye(3)).left for s in _DELAYS_S}
+        found[name] = ForceVerdict(fits[0], best, alone, delays, equations.delay())
     return found
-
-
-def _ahead(imu: ImuStream, seconds: float) -> ImuStream:
-    """The IMU with forces that were measured so much later than its stamps say."""
-    times = (imu.timestamps_ns - imu.timestamps_ns[0]) * 1e-9
-    moved = [np.interp(times + seconds, times, imu.accel[:, k]) for k in range(3)]
-    return replace(imu, accel=np.stack(moved, axis=1))
-
-
-def _left(trajectory: Trajectory, imu: ImuStream, fit: TurnFit) -> float:
-    return ForceEquations(trajectory, imu, fit).solve(np.eye(3)).left
 
 
 def check_forces(verdicts: Mapping[str, ForceVerdict]) -> tuple[SensorCheck, ...]:
@@ -89,7 +81,8 @@ def check_forces(verdicts: Mapping[str, ForceVerdict]) -> tuple[SensorCheck, ...
         return (own,)
     if len(wrong) * 2 <= len(verdicts):
         left = float(np.median([v.given.left for v in verdicts.values()]))
-        sound = SensorCheck("accelerometer", True, left, left, quantity=quantity)
+        words, advice = _large_bias(verdicts)
+        sound = SensorCheck("accelerometer", True, left, left, words, advice, quantity)
         return (sound, *(_mirrored(name, verdicts[name]) for name in wrong))
     name = min(wrong, key=lambda n: verdicts[n].best.left)
     v = verdicts[name]
@@ -99,6 +92,21 @@ def check_forces(verdicts: Mapping[str, ForceVerdict]) -> tuple[SensorCheck, ...
         words = wrong[name]
     remedy = "Correct the accelerometer's axes and signs: at rest it shows +9.81 on the axis that points up."
     return (SensorCheck("accelerometer", False, v.given.left, v.best.left, f"{words}.", remedy, quantity),)
+
+
+def _large_bias(verdicts: Mapping[str, ForceVerdict]) -> tuple[str, str]:
+    """Words and advice about a bias that an accelerometer may have, but that may as well be something else."""
+    bias = np.median([v.given.bias for v in verdicts.values()], axis=0)
+    stds = np.median([v.given.bias_std for v in verdicts.values()], axis=0)
+    bias = np.where(stds < 0.2 * _LARGE_BIAS, bias, 0.0)
+    size = float(np.linalg.norm(bias))
+    if size < _LARGE_BIAS:
+        return "", ""
+    words = (
+        f"its bias is {size:.2f} m/s^2; if its axes are turned against the gyroscope's by "
+        f"{np.rad2deg(size / GRAVITY):.1f} deg it looks the same, and all cameras are turned by that."
+    )
+    return words, "Calibrate it at rest, in six positions."
 
 
 def _what_is_wrong(v: ForceVerdict) -> str:
@@ -144,7 +152,7 @@ def _of_itself(verdicts: Mapping[str, ForceVerdict]) -> SensorCheck | None:
     if len(delayed) * 2 > len(verdicts):
         late = float(np.median(delayed))
         side = "late" if late > 0 else "early"
-        words = f"its samples are stamped {abs(late):g} s too {side} against the gyroscope's."
+        words = f"its samples are stamped {abs(late):.2g} s too {side} against the gyroscope's."
         remedy = "Stamp gyroscope and accelerometer together, when they are read."
         return SensorCheck("accelerometer", False, late, 0.0, words, remedy, "delay behind the gyroscope, s")
     return None
@@ -153,9 +161,11 @@ def _of_itself(verdicts: Mapping[str, ForceVerdict]) -> SensorCheck | None:
 def _delay(v: ForceVerdict) -> float | None:
     """The delay that makes the forces fit; None where none does."""
     best = min(v.delays, key=lambda s: v.delays[s], default=None)
-    if best is None or v.delays[best] > _CLEARLY_BETTER * min(v.given.left, v.best.left):
-        return None
-    return best
+    if best is not None and v.delays[best] <= _CLEARLY_BETTER * min(v.given.left, v.best.left):
+        return best
+    seconds, std = v.delay
+    fits = v.given.left < _FITTING * v.given.moved  # else it may be anything
+    return seconds if fits and abs(seconds) > max(_DELAY_S, _DELAY_SIGMAS * std) else None
 
 
 def _is_deaf(axis: AxisFit, given: ForceFit) -> bool:

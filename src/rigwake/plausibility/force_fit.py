@@ -12,6 +12,7 @@ tried, and the one that leaves least is right. Nothing but the bias is believed 
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 
@@ -28,7 +29,9 @@ from rigwake.trajectory import Trajectory
 GRAVITY = 9.80665
 _H_S = 0.5
 _BIAS_STD, _LEVER_STD = 0.3, 5.0
-_FEWEST = 16
+_FEWEST, _MOST = 16, 1200  # windows; of a long recording so many, spread over it, tell as much as is asked
+_DELAY_STEP_S, _DELAY_STD_S = 0.05, 1.0
+_ALIKE = 8  # neighbouring windows whose errors count as one
 _MEDIAN_LENGTH = {2: 1.18, 3: 1.54}  # of vectors whose components have a standard deviation of one
 
 
@@ -87,6 +90,8 @@ class ForceEquations:
         centres = np.arange(first, last, round(0.5 * _H_S * 1e9))
         if len(centres) < _FEWEST:
             raise UnobservableError(f"{trajectory.name}: too short together with {imu.name}.")
+        if len(centres) > _MOST:
+            centres = centres[np.linspace(0, len(centres) - 1, _MOST).astype(np.int64)]
         h = round(_H_S * 1e9)
         shift = round(turns.time_offset_s * 1e9)
         at = [
@@ -102,7 +107,16 @@ class ForceEquations:
         self.to_world = self.world_from_imu @ self.to_world
         self.path_term = (at[0].translation - 2 * at[1].translation + at[2].translation) / _H_S**2
         self.lever_term = (at[0].rotation - 2 * at[1].rotation + at[2].rotation) / _H_S**2
+        self.imu, self.start_from_imu, self.centres = imu, turned.rotation, centres
         self._integrals(imu, turned.rotation, centres)
+
+    def ahead(self, seconds: float) -> ForceEquations:
+        """The same with forces that were measured so much later than their stamps say."""
+        times = (self.imu.timestamps_ns - self.imu.timestamps_ns[0]) * 1e-9
+        moved = [np.interp(times + seconds, times, self.imu.accel[:, k]) for k in range(3)]
+        found = copy(self)
+        found._integrals(replace(self.imu, accel=np.stack(moved, axis=1)), self.start_from_imu, self.centres)
+        return found
 
     def _integrals(self, imu: ImuStream, start_from_imu: Array, centres: Stamps) -> None:
         """Forces and rotations under the triangle round every centre: (N, 3, 3, 3) and (N, 3, 3)."""
@@ -129,6 +143,25 @@ class ForceEquations:
         return ForceFit(
             axes, float(x[0]), float(stds[0] / max(abs(x[0]), 1e-12)), x[1:4], rms, reach, x[7:], stds[7:]
         )
+
+    def delay(self) -> tuple[float, float]:
+        """Seconds by which the forces are stamped late, as an unknown beside the others, and its deviation.
+
+        By how the forces change with the stamps: good to about a third of a second.
+        """
+        right, late, early = (
+            np.einsum("naxx->na", e.force)
+            for e in (self, self.ahead(_DELAY_STEP_S), self.ahead(-_DELAY_STEP_S))
+        )
+        changing = (early - late) / (2 * _DELAY_STEP_S)
+        columns = np.concatenate([self._columns(), changing[:, :, None]], axis=2)
+        x, H, size, off = self._least(columns, right)
+        weights = 1 / (1 + (off / (3 * size)) ** 2)
+        scores = np.einsum("nar,n,na->nr", columns, weights, np.einsum("nar,r->na", columns, x) - right)
+        sums = np.add.reduceat(scores, np.arange(0, len(scores), _ALIKE), axis=0)
+        inverse = np.linalg.inv(H)
+        scattered = float((inverse @ (sums.T @ sums) @ inverse)[10, 10])
+        return float(x[10]), float(np.sqrt(max(scattered, 2.0 * size**2 * float(inverse[10, 10]))))
 
     def alone(self, axis: int) -> AxisFit:
         """One axis of the accelerometer against what the two others and vision say of it.
@@ -160,17 +193,18 @@ class ForceEquations:
         return columns
 
     def _least(self, columns: Array, right: Array) -> tuple[Array, Array, float, Array]:
-        """Unknowns (10,), their information for a residual of one, its robust size per axis, and residuals (N,)."""
-        n, axes = right.shape
-        A, b = columns.reshape(-1, 10), right.reshape(-1)
-        prior = np.zeros(10)
+        """Unknowns (C,), their information for a residual of one, its robust size per axis, and residuals (N,)."""
+        (n, axes), free = right.shape, columns.shape[2]
+        A, b = columns.reshape(-1, free), right.reshape(-1)
+        prior = np.zeros(free)
         weights: Array = np.ones(n)
-        x: Array = np.zeros(10)
-        size, H = 0.1, np.eye(10)
+        x: Array = np.zeros(free)
+        size, H = 0.1, np.eye(free)
         for _ in range(8):
-            prior[4:7], prior[7:] = (size / _LEVER_STD) ** 2, (size / _BIAS_STD) ** 2
+            prior[4:7], prior[7:10] = (size / _LEVER_STD) ** 2, (size / _BIAS_STD) ** 2
+            prior[10:] = (size / _DELAY_STD_S) ** 2
             w = np.repeat(weights, axes)
-            H = (A * w[:, None]).T @ A + np.diag(prior) + 1e-12 * np.eye(10) * self.unit**2
+            H = (A * w[:, None]).T @ A + np.diag(prior) + 1e-12 * np.eye(free) * self.unit**2
             x = np.asarray(np.linalg.solve(H, A.T @ (w * b)), dtype=np.float64)
             off = np.linalg.norm((A @ x - b).reshape(-1, axes), axis=1)
             size = max(float(np.median(off)) / _MEDIAN_LENGTH[axes], 1e-4)

@@ -18,7 +18,7 @@ _GRAVITY_TOLERANCE = 0.06
 _HELD_RUN, _CLIPPED_RUN = 10, 3
 _DISTINCT = 50  # values of an axis
 _MOST_LOST = 0.2  # of the samples
-_LONG_GAP_S = 0.1
+_LONG_GAP_S, _MANY_GAPS = 0.1, 20
 # of one axis: so long, and so many times the usual run of equal values, which a coarse converter repeats too
 _STILL_S, _STILL_RUNS = 1.0, 30.0
 
@@ -161,6 +161,14 @@ def _gaps(imu: ImuStream, repair: bool) -> tuple[ImuStream, list[SensorCheck]]:
         return imu, []
     at = (imu.timestamps_ns[int(steps.argmax())] - imu.timestamps_ns[0]) * 1e-9
     count = int(np.sum(steps > max(_LONG_GAP_S, 5 * usual)))
+    lost = float(steps[steps > max(_LONG_GAP_S, 5 * usual)].sum() / steps.sum())
+    if count >= _MANY_GAPS and lost > 0.5:
+        words = (
+            f"its stamps come in bunches ({count} gaps of {longest:.2f} s at most are {100 * lost:.0f} % of the time): "
+            "they say when samples arrived, not when they were measured, or most samples are lost."
+        )
+        remedy = "Stamp samples when they are taken."
+        return imu, [SensorCheck("imu", False, lost, 0.5, words, remedy, "part of the time in gaps")]
     words = f"{count} gaps, the longest of {longest:.2f} s at {at:.1f} s; bridged by vision."
     return imu, [SensorCheck("imu", True, longest, _LONG_GAP_S, words, "", "longest gap, s")]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from rigwake.cameras.protocol import CameraModel
 from rigwake.errors import RigwakeError
-from rigwake.plausibility.lens_fit import LensFit, fit_lens
+from rigwake.plausibility.lens_fit import LensFit, fit_lens, focal_growth
 from rigwake.plausibility.values import SensorCheck
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
@@ -16,6 +16,7 @@ from rigwake.trajectory import Trajectory
 _SCALE = 0.0075
 _SHIFT_PX, _SHIFT_OF_WIDTH = 2.0, 0.003
 _SIGMAS = 6.0
+_GROWTH = 0.005  # of the focal length during a recording; warmth does less, and good recordings show 0.003
 _UNCERTAIN_SCALE, _UNCERTAIN_PX = 0.01, 5.0  # a fit less sure than this says nothing
 # noise of tracks pulls a lens by its square: per px^2 of the epipolar distances, found on simulated ferries
 _PULL_SCALE, _PULL_PX = 0.5, 450.0
@@ -60,7 +61,9 @@ def check_lenses(
         lens = models[name]
         quantity = "focal length by its tracks over that given"
         if not is_off(fit, lens.width_px):
-            checks.append(SensorCheck(f"camera {name}", True, fit.scale, 1.0, quantity=quantity, part="lens"))
+            grown = _growth(name, fit, tracks[name], lens, trajectories[name])
+            sound = SensorCheck(f"camera {name}", True, fit.scale, 1.0, quantity=quantity, part="lens")
+            checks.append(sound if grown is None else grown)
             continue
         std = np.sqrt(np.diag(fit.covariance))
         words = (
@@ -75,6 +78,23 @@ def check_lenses(
             SensorCheck(f"camera {name}", False, fit.scale, 1.0, hypothesis, remedy, quantity, part="lens")
         )
     return tuple(checks)
+
+
+def _growth(
+    name: str, fit: LensFit, tracks: Tracks, lens: CameraModel, trajectory: Trajectory
+) -> SensorCheck | None:
+    """A focal length that changes from the beginning to the end, by more than chance and more than matters."""
+    found = focal_growth(tracks, lens, trajectory)
+    limit = _GROWTH + _PULL_SCALE * fit.refined_rms_px**2
+    if found is None or abs(found[0]) < max(limit, _SIGMAS * found[1]):
+        return None
+    words = (
+        f"its focal length changes during the recording: by {100 * found[0]:+.2f} ± {100 * found[1]:.2f} % from the "
+        "first third to the last (autofocus, or somebody turned the lens)."
+    )
+    remedy = "Fix its focus; calibrate a part (--start, --duration)."
+    quantity = "focal length in the last third over that in the first, less one"
+    return SensorCheck(f"camera {name}", False, found[0], limit, words, remedy, quantity)
 
 
 def is_turned(fit: LensFit, lens: CameraModel) -> bool:

@@ -79,6 +79,21 @@ def fit_lens(
     return _without_bias(fit, pairs, model, scale_std) if unbiased else fit
 
 
+def focal_growth(tracks: Tracks, model: CameraModel, trajectory: Trajectory) -> tuple[float, float] | None:
+    """Focal length in the last third of the pairs of images over that in the first, less one, and its deviation.
+
+    None where a third has fewer than 8 pairs.
+    """
+    pairs = choose_pairs(tracks, trajectory)
+    third = len(pairs.rotation) // 3
+    if third < _FEWEST_PAIRS:
+        return None
+    ends = [np.arange(third), np.arange(len(pairs.rotation) - third, len(pairs.rotation))]
+    first, last = (_minimise(pairs.take(index), model, _SCALE_STD) for index in ends)
+    std = float(np.sqrt(first.covariance[0, 0] + last.covariance[0, 0]))
+    return last.scale / first.scale - 1, std
+
+
 def _without_bias(fit: LensFit, pairs: ViewPairs, model: CameraModel, scale_std: float) -> LensFit:
     rng = np.random.default_rng(0)
     noisy = []

@@ -17,7 +17,7 @@ from rigwake.plausibility.receiver_fit import (
     fit_receiver,
     frozen_rows,
 )
-from rigwake.plausibility.receiver_repeats import never_moves, repeated_rows, without_heights
+from rigwake.plausibility.receiver_repeats import never_moves, repeated_rows, with_rounding, without_heights
 from rigwake.plausibility.receiver_wrongs import check_heights, clock_confusion, rows_of_one_level
 from rigwake.plausibility.values import SensorCheck
 from rigwake.recording import GnssStream
@@ -207,6 +207,15 @@ def _without_repeats(gnss: GnssStream, repair: bool) -> tuple[GnssStream, list[S
         check = SensorCheck(f"gnss {gnss.name}", False, 0.0, 0.0, words, remedy, "range of its heights, m")
         gnss, checks = (flat, [check.with_action("repaired")]) if repair else (gnss, [check])
     repeated = repeated_rows(gnss)
+    gnss, digit = with_rounding(gnss)
+    if digit > 0:
+        words = f"its positions are rounded to {digit:.2f} m, which counts as noise."
+        remedy = "Record all digits."
+        checks.append(
+            SensorCheck(
+                f"gnss {gnss.name}", True, digit, 0.0, words, remedy, "last digit of its positions, m"
+            )
+        )
     if not repeated.any():
         return gnss, checks
     words = f"{int(repeated.sum())} of {len(repeated)} fixes repeat the one before to the last digit"

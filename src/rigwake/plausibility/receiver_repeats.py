@@ -14,6 +14,8 @@ _LEAST_STEP_M = 0.05  # below, a vessel that lies still or a coarse last digit r
 _DIGIT_STEPS, _NO_STEP_M, _LEAST_DIGIT_M = 1.5, 2e-3, 0.01
 _WORTH_A_WORD = 0.02  # of the fixes
 _UNKNOWN_HEIGHT_M = 100.0
+_OFF_GRID, _ON_GRID = 0.1, 0.95  # digits off a whole one, and the fraction of the steps that must be on one
+_COARSE_M = 0.05  # of a last digit, from which on it counts as noise
 _ONE_HEIGHT_M = 1e-3
 _EQUATOR_M, _ECCENTRICITY_2 = 6378137.0, 6.69438e-3  # WGS 84
 
@@ -32,6 +34,26 @@ def repeated_rows(gnss: GnssStream) -> NDArray[np.bool_]:
     run = np.cumsum(~same) - 1
     steps = np.append(np.linalg.norm(np.diff(p[other], axis=0), axis=1), 0.0)
     return np.asarray(same & (steps[run] > max(_LEAST_STEP_M, _DIGIT_STEPS * _last_digit(p[other]))))
+
+
+def with_rounding(gnss: GnssStream) -> tuple[GnssStream, float]:
+    """The fixes with the variance of their last digit added, east and north, and the metres of that digit; 0 where it
+    is fine, or far below the stated deviation."""
+    p = gnss.position_enu
+    other = np.concatenate([[True], (np.diff(p, axis=0) != 0).any(axis=1)])
+    digit = _last_digit(p[other])
+    stated = float(np.sqrt(np.median(gnss.covariances[:, [0, 1], [0, 1]]))) if len(gnss.covariances) else 0.0
+    if digit < max(_COARSE_M, 0.5 * stated) or not _on_grid(p[other], digit):
+        return gnss, 0.0
+    return replace(gnss, covariances=gnss.covariances + np.diag([digit**2 / 12, digit**2 / 12, 0.0])), digit
+
+
+def _on_grid(p: Array, digit: float) -> bool:
+    """Whether fixes move by whole digits along the axis of that digit."""
+    for steps in np.diff(p[:, :2], axis=0).T / digit:
+        if np.mean(np.abs(steps - np.round(steps)) < _OFF_GRID) > _ON_GRID:
+            return True
+    return False
 
 
 def _last_digit(p: Array) -> float:

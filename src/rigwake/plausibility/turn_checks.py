@@ -24,6 +24,9 @@ _TURNED = np.deg2rad(0.2)
 # by which the robust cost falls when a knock is undone: one bad rotation among many gains 0.1
 _CONFIRMED = 3.0
 _FEWEST = 8  # strides on either side of a change
+_MOST_SPLITS = (
+    200  # that are tried at once: of a long recording evenly spread ones, then those beside the best
+)
 
 
 def check_scale(
@@ -156,11 +159,18 @@ def mount_change(fit: TurnFit) -> MountChange | None:
             knocks.append(replace(_split(fit, gyro, k, 1), knock=float(sizes[k])))
     if knocks:
         return max(knocks, key=lambda found: found.knock or 0.0)
-    costs = [
-        _misfit(turns[:k], gyro[:k], fit.rms) + _misfit(turns[k:], gyro[k:], fit.rms)
-        for k in range(_FEWEST, n - _FEWEST + 1)
-    ]
-    best = _split(fit, gyro, _FEWEST + int(np.argmin(costs)), 0)
+    first, last = _FEWEST, n - _FEWEST
+    while True:
+        step = max(1, (last - first) // _MOST_SPLITS)
+        costs = {
+            k: _misfit(turns[:k], gyro[:k], fit.rms) + _misfit(turns[k:], gyro[k:], fit.rms)
+            for k in range(first, last + 1, step)
+        }
+        at = min(costs, key=lambda k: costs[k])
+        if step == 1:
+            break
+        first, last = max(first, at - step), min(last, at + step)
+    best = _split(fit, gyro, at, 0)
     return best if best.turned > max(_TURNED, _SIGMAS * best.std) else None
 
 

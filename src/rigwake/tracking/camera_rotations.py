@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from rigwake._types import Array, Image, Mask
+from rigwake._types import Array, Image, Indices, Mask, Stamps
 from rigwake.errors import EstimationError, UsageError
 from rigwake.geometry.se3 import SE3
 from rigwake.parallel import in_order
@@ -27,29 +27,29 @@ _CORNERS = 120
 _MIN_MATCHES = 12
 _WINDOW_PX, _LEVELS = 21, 4  # of the search
 _MAX_GAP_S = 0.5
+_LEAST_STEP_S = 0.1  # between pictures that are compared: at 30 a second, 150 in a row would be five seconds
 _WIDEST_PX = 1000  # larger pictures are halved: a degree shows in small ones too
 
 
 def visual_rotations(stream: CameraStream, *, frames: int = 150) -> Trajectory:
     """A trajectory whose rotations are the camera's turns, and whose positions are all zero.
 
-    frames: at most so many, in a row, from the middle of the recording. It drifts by degrees, and points on the
-    hull or on water pull it a little: good to a degree, not to be calibrated from. Segments end where images
+    frames: at most so many, up to ten a second, from the middle of the recording. It drifts by degrees, and points on
+    the hull or on water pull it a little: good to a degree, not to be calibrated from. Segments end where images
     show too little. Raises UsageError without a model, EstimationError when hardly any image can be compared.
     """
     if stream.model is None:
         raise UsageError(
             f"camera {stream.name} has no intrinsics.", remedy="Calibrate one with `rigwake intrinsics`."
         )
-    count = min(frames, len(stream))
-    start = (len(stream) - count) // 2
+    chosen = _from_the_middle(stream.timestamps_ns, frames)
     octaves = 0
     while stream.width_px / 2**octaves > _WIDEST_PX:
         octaves += 1
     usable = ~beyond_lens(stream.model)[:: 2**octaves, :: 2**octaves]
     stamps: list[int] = []
     rotations, segments = [np.eye(3)], [0]
-    pairs = pairwise(stream.frames(np.arange(start, start + count)))
+    pairs = pairwise(stream.frames(chosen))
     turn_of = partial(_turn, rays=ReducedRays(stream.model, 2**octaves), octaves=octaves, usable=usable)
     for before_ns, after_ns, turn in in_order(turn_of, pairs):
         rotations.append(rotations[-1] @ (np.eye(3) if turn is None else turn.T))
@@ -67,6 +67,15 @@ def visual_rotations(stream: CameraStream, *, frames: int = 150) -> Trajectory:
         SE3(matrices, np.zeros((len(stamps), 3))),
         segment_ids=np.array(segments, dtype=np.int64),
     )
+
+
+def _from_the_middle(stamps: Stamps, frames: int) -> Indices:
+    """At most so many frames around the middle one, up to ten a second."""
+    period = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 1.0
+    step = max(1, int(_LEAST_STEP_S / max(period, 1e-3) + 0.1))
+    count = min(frames, -(-len(stamps) // step))
+    start = (len(stamps) - 1 - step * (count - 1)) // 2
+    return np.arange(start, start + step * count, step)
 
 
 def _turn(
