@@ -30,7 +30,7 @@ from rigwake.views.surround_rig import SurroundRig, surround_rig
 from segmentation_scenes import labels_of, rectangle_view
 
 GRID = StripGrid()
-CLOSE = ("quay", "marina", "basin")
+CLOSE = ("quay", "marina", "basin", "pier", "haven")
 BUOY_RADIUS_M = 0.3
 BUOY_RANGES_M = (5.0, 8.0, 11.0, 15.0, 15.0, 15.0, 20.0, 25.0, 30.0)
 _BEFORE = 3  # frames: half a second
@@ -52,6 +52,18 @@ _CHANGES: dict[str, tuple[str, dict[str, Any]]] = {
         "sea": {"hs_m": 0.12, "tp_s": 2.6},
         "weather": {"sun_azimuth_deg": 200, "sun_elevation_deg": 30, "cloud_cover": 0.7},
         "vessel": {"hull": "catamaran", "manoeuvres": _STRAIGHT},
+    }),
+    "pier": ("quay", {
+        "seed": 2203, "scene": {"layout": "canal", "size_m": [70, 34], "density": 1.2},
+        "weather": {"sun_azimuth_deg": 250, "sun_elevation_deg": 24, "cloud_cover": 0.6},
+    }),
+    "haven": ("marina", {
+        "seed": 3319, "weather": {"sun_azimuth_deg": 30, "sun_elevation_deg": 40, "cloud_cover": 0.3},
+    }),
+    "sound": ("demo", {
+        "seed": 4421, "scene": {"layout": "bay", "size_m": [200, 220], "density": 0.7},
+        "sea": {"hs_m": 0.2, "tp_s": 3.0},
+        "weather": {"sun_azimuth_deg": 310, "sun_elevation_deg": 22, "cloud_cover": 0.3},
     }),
 }  # fmt: skip
 SCENES = tuple(_CHANGES)
