@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import product
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,7 +14,7 @@ from rigwake.views.attitude import LevelAttitude, track_from_trajectory
 from rigwake.views.depth import height_check
 from rigwake.views.depth.depth_files import point_cloud
 from rigwake.views.depth.depth_panorama import MATCHED, PLANE, fuse_depth, matched_points
-from rigwake.views.depth.epipolar import MatchedPoints, epipolar_pairs
+from rigwake.views.depth.epipolar import MatchedPoints, _semi_global, epipolar_pairs
 from rigwake.views.depth.motion import Earlier, earlier_time, moved_points
 from rigwake.views.depth.sgm import match_around
 from rigwake.views.depth.sweep import SWEEP_GRID, swept_points
@@ -199,6 +200,22 @@ def test_ranges_of_two_cameras(seen) -> None:  # type: ignore[no-untyped-def]
     cloud = point_cloud(depth, level_strip(images, rig, stand, WaterAndShell(40.0), GRID))
     assert cloud.startswith(b"ply")
     assert len(cloud) > 19 * on_wall.sum()
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_matches_on_a_slanted_plane_do_not_lag(turn: int) -> None:
+    """Water comes nearer from row to row."""
+    noise = np.random.default_rng(2).uniform(0, 255, (120, 400)).astype(np.float32)
+    right = cv2.GaussianBlur(noise, (0, 0), 1.2)
+    right = np.clip(128 + 2.5 * (right - right.mean()), 0, 255)
+    disparity = (10 + 0.2 * np.arange(120))[::turn]
+    column = np.arange(400, dtype=np.float32)
+    u, v = column[None, :] - disparity[:, None], np.repeat(np.arange(120.0)[:, None], 400, axis=1)
+    left = cv2.remap(right, u.astype(np.float32), v.astype(np.float32), cv2.INTER_CUBIC)
+    found = _semi_global(np.clip(left, 0, 255).astype(np.uint8), right.astype(np.uint8), 48)
+    error = (found - disparity[:, None])[10:-10, 60:][found[10:-10, 60:] >= 0]
+    assert len(error) > 20_000
+    assert abs(np.median(error)) < 0.05
 
 
 def test_the_nearer_of_two_groups_counts_and_jumps_are_not_trusted() -> None:
