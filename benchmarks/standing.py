@@ -3,11 +3,11 @@
     python benchmarks/standing.py [--folder SHOTS] [--scenes quay marina ..] [--sets 3] [--only labels stixels ..]
     python benchmarks/standing.py --scenes marina --pictures docs      # the pictures of the documentation
 
-Three scenes are close quarters (`quay`, `pier`, `haven`), three are open (`bay`, `buoys`, `sound`); no network was
-trained on them, and `pier`, `haven` and `sound` were looked at for no constant but the weight of points in the plane at
-the far edge of the water (`sound`). Others: `marina`, `basin`, `demo` (`view_shots.py`). Attitude, way and height are the true ones, but where the height is estimated. Range
-errors are medians; NEES/dof is the median squared error in units of the predicted variance over that of a normal
-distribution.
+Three scenes are close quarters (`quay`, `pier`, `haven`), three are open (`bay`, `buoys`, `strait`); no network was
+trained on them, and no constant was chosen on `pier`, `haven` and `strait`. Others: `marina`, `basin`, `demo`, `sound`
+(`view_shots.py`). Attitude, way and height are the true ones, but where the height is estimated. Range errors are
+medians; NEES/dof is the median squared error in units of the predicted variance over that of a normal distribution.
+"sweep": the sphere sweep in place of pairs and motion.
 """
 
 from __future__ import annotations

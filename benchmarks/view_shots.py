@@ -65,10 +65,15 @@ _CHANGES: dict[str, tuple[str, dict[str, Any]]] = {
         "sea": {"hs_m": 0.2, "tp_s": 3.0},
         "weather": {"sun_azimuth_deg": 310, "sun_elevation_deg": 22, "cloud_cover": 0.3},
     }),
+    "strait": ("demo", {
+        "seed": 5527, "scene": {"layout": "bay", "size_m": [260, 170], "density": 0.9},
+        "sea": {"hs_m": 0.15, "tp_s": 2.8},
+        "weather": {"sun_azimuth_deg": 120, "sun_elevation_deg": 28, "cloud_cover": 0.6},
+    }),
 }  # fmt: skip
 SCENES = tuple(_CHANGES)
-JUDGED = ("quay", "pier", "haven", "bay", "buoys", "sound")
-UNSEEN = ("pier", "haven", "sound")  # no constant was chosen on these
+JUDGED = ("quay", "pier", "haven", "bay", "buoys", "strait")
+UNSEEN = ("pier", "haven", "strait")  # no constant was chosen on these
 
 
 @dataclass(frozen=True, eq=False)
