@@ -21,6 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
 from rigwake.views.colour import ColourModel
+from rigwake.views.depth.sweep import swept_points
 from rigwake.views.frames import FrameSet
 from rigwake.views.projections import EquirectangularView, TopDown
 from rigwake.views.strips import level_strip
@@ -79,6 +80,7 @@ def main() -> None:
         "panorama, attitude and surface new": lambda: anew(view, out),
         "top view 1000 x 1000, attitude new": lambda: anew(top, ground),
         "decoding four JPEGs": decode,
+        "sphere sweep 768 x 216 x 64": lambda: swept_points(frames.images(rig), rig, stand),
         "level strip 900 x 190": lambda: level_strip(frames.images(rig), rig, stand, surface),
     }
     print(f"{'':38}{'CPU ms':>8}{'ratio':>8}{'fps':>7}")

@@ -1,6 +1,6 @@
 """Frame sets of simulated scenes with everything known about them, for benchmarks of the views.
 
-Six scenes that no network was trained on, three of them close quarters. Pictures, the own hull, the attitude, and what
+Scenes that no network was trained on, about half of them close quarters. Pictures, the own hull, the attitude, and what
 a camera in the viewpoint would see (classes and ranges in the grid of the level strip) are kept in a folder.
 """
 
@@ -30,7 +30,7 @@ from rigwake.views.surround_rig import SurroundRig, surround_rig
 from segmentation_scenes import labels_of, rectangle_view
 
 GRID = StripGrid()
-CLOSE = ("quay", "marina", "basin")
+CLOSE = ("quay", "marina", "basin", "pier", "haven")
 BUOY_RADIUS_M = 0.3
 BUOY_RANGES_M = (5.0, 8.0, 11.0, 15.0, 15.0, 15.0, 20.0, 25.0, 30.0)
 _BEFORE = 3  # frames: half a second
@@ -53,8 +53,27 @@ _CHANGES: dict[str, tuple[str, dict[str, Any]]] = {
         "weather": {"sun_azimuth_deg": 200, "sun_elevation_deg": 30, "cloud_cover": 0.7},
         "vessel": {"hull": "catamaran", "manoeuvres": _STRAIGHT},
     }),
+    "pier": ("quay", {
+        "seed": 2203, "scene": {"layout": "canal", "size_m": [70, 34], "density": 1.2},
+        "weather": {"sun_azimuth_deg": 250, "sun_elevation_deg": 24, "cloud_cover": 0.6},
+    }),
+    "haven": ("marina", {
+        "seed": 3319, "weather": {"sun_azimuth_deg": 30, "sun_elevation_deg": 40, "cloud_cover": 0.3},
+    }),
+    "sound": ("demo", {
+        "seed": 4421, "scene": {"layout": "bay", "size_m": [200, 220], "density": 0.7},
+        "sea": {"hs_m": 0.2, "tp_s": 3.0},
+        "weather": {"sun_azimuth_deg": 310, "sun_elevation_deg": 22, "cloud_cover": 0.3},
+    }),
+    "strait": ("demo", {
+        "seed": 5527, "scene": {"layout": "bay", "size_m": [260, 170], "density": 0.9},
+        "sea": {"hs_m": 0.15, "tp_s": 2.8},
+        "weather": {"sun_azimuth_deg": 120, "sun_elevation_deg": 28, "cloud_cover": 0.6},
+    }),
 }  # fmt: skip
 SCENES = tuple(_CHANGES)
+JUDGED = ("quay", "pier", "haven", "bay", "buoys", "strait")
+UNSEEN = ("pier", "haven", "strait")  # no constant was chosen on these
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,9 @@
 """Stixels and ranges: exactness of the cut, ranges against a known world, honesty of their uncertainty."""
 
+from dataclasses import replace
 from itertools import product
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,8 +14,10 @@ from rigwake.views.attitude import LevelAttitude, track_from_trajectory
 from rigwake.views.depth import height_check
 from rigwake.views.depth.depth_files import point_cloud
 from rigwake.views.depth.depth_panorama import MATCHED, PLANE, fuse_depth, matched_points
-from rigwake.views.depth.epipolar import MatchedPoints, epipolar_pairs
+from rigwake.views.depth.epipolar import MatchedPoints, _semi_global, epipolar_pairs
 from rigwake.views.depth.motion import Earlier, earlier_time, moved_points
+from rigwake.views.depth.sgm import match_around
+from rigwake.views.depth.sweep import SWEEP_GRID, swept_points
 from rigwake.views.scene.segmentation import Labels
 from rigwake.views.scene.stixel_cut import cut_columns
 from rigwake.views.scene.stixel_files import world_to_dict
@@ -68,6 +72,68 @@ def cheapest_by_trying_all(cost: np.ndarray, horizon: int) -> float:
             if allowed:
                 best = min(best, total)
     return best
+
+
+def plain_sgm(cost: np.ndarray, p1: float, p2: float) -> np.ndarray:
+    """Sums of the four paths, as the method is written down; along the rows ten times around."""
+    rows, columns, _ = cost.shape
+
+    def step(here: np.ndarray, before: np.ndarray) -> np.ndarray:
+        least = before.min()
+        up = np.append(before[1:], np.inf) + p1
+        down = np.append(np.inf, before[:-1]) + p1
+        return here + np.minimum.reduce([before, up, down, np.full_like(before, least + p2)]) - least
+
+    total = np.zeros(cost.shape)
+    for order in (1, -1):
+        for r in range(rows):
+            path = np.zeros(cost.shape[2])
+            laps = [c for _ in range(10) for c in range(columns)[::order]]
+            for n, c in enumerate(laps):
+                path = step(cost[r, c], path)
+                total[r, c] += path if n >= 9 * columns else 0
+        for c in range(columns):
+            path = np.zeros(cost.shape[2])
+            for r in range(rows)[::order]:
+                path = step(cost[r, c], path)
+                total[r, c] += path
+    return total
+
+
+def test_matching_around_is_that_of_the_textbook_and_has_no_edge() -> None:
+    cost = np.random.default_rng(3).integers(0, 90, (5, 12, 7), dtype=np.uint8)
+    level, ratio = match_around(cost)
+    sums = plain_sgm(cost.astype(float), 12.0, 60.0)
+    best = sums.argmin(axis=2)
+    assert (np.abs(level - best) <= 0.5).all()
+    apart = np.abs(np.arange(7) - best[..., None]) > 1
+    second = np.where(apart, sums, np.inf).min(axis=2)
+    np.testing.assert_allclose(ratio, second / sums.min(axis=2), rtol=1e-5)
+    turned = match_around(np.roll(cost, 3, axis=1))
+    np.testing.assert_array_equal(turned[0], np.roll(level, 3, axis=1))
+
+
+def test_a_sweep_of_spheres_finds_the_ring_wherever_it_is_cut_open(seen) -> None:  # type: ignore[no-untyped-def]
+    rig, stand, images, _ = seen
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # ahead becomes port
+    turned = replace(stand, level_from_rig=quarter @ stand.level_from_rig)
+    found = [swept_points(images, rig, which).points_level for which in (stand, turned)]
+    planes = []
+    for points, shift in zip(found, (0, SWEEP_GRID.columns // 4), strict=True):
+        distance = np.linalg.norm(points, axis=1)
+        at = np.round(SWEEP_GRID.pixels(points / distance[:, None])).astype(int)
+        plane = np.full((SWEEP_GRID.rows, SWEEP_GRID.columns), np.nan)
+        plane[at[:, 1], (at[:, 0] + shift) % SWEEP_GRID.columns] = distance
+        planes.append(plane)
+        wall = (points[:, 2] > -1.5) & (points[:, 2] < 1.5)
+        behind = wall & (np.abs(np.arctan2(points[:, 1], points[:, 0])) > np.deg2rad(170))
+        for chosen in (wall, behind):
+            error = np.hypot(points[chosen, 0], points[chosen, 1]) / RADIUS_M - 1
+            assert len(error) > 700
+            assert np.median(np.abs(error)) < 0.04  # a step of the sweep is 6 % there
+    both = np.isfinite(planes).all(axis=0)
+    assert both.sum() > 0.97 * np.isfinite(planes[0]).sum()
+    assert np.mean(np.abs(planes[0] / planes[1] - 1)[both] < 0.01) > 0.97
 
 
 @pytest.mark.slow
@@ -134,6 +200,22 @@ def test_ranges_of_two_cameras(seen) -> None:  # type: ignore[no-untyped-def]
     cloud = point_cloud(depth, level_strip(images, rig, stand, WaterAndShell(40.0), GRID))
     assert cloud.startswith(b"ply")
     assert len(cloud) > 19 * on_wall.sum()
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_matches_on_a_slanted_plane_do_not_lag(turn: int) -> None:
+    """Water comes nearer from row to row."""
+    noise = np.random.default_rng(2).uniform(0, 255, (120, 400)).astype(np.float32)
+    right = cv2.GaussianBlur(noise, (0, 0), 1.2)
+    right = np.clip(128 + 2.5 * (right - right.mean()), 0, 255)
+    disparity = (10 + 0.2 * np.arange(120))[::turn]
+    column = np.arange(400, dtype=np.float32)
+    u, v = column[None, :] - disparity[:, None], np.repeat(np.arange(120.0)[:, None], 400, axis=1)
+    left = cv2.remap(right, u.astype(np.float32), v.astype(np.float32), cv2.INTER_CUBIC)
+    found = _semi_global(np.clip(left, 0, 255).astype(np.uint8), right.astype(np.uint8), 48)
+    error = (found - disparity[:, None])[10:-10, 60:][found[10:-10, 60:] >= 0]
+    assert len(error) > 20_000
+    assert abs(np.median(error)) < 0.05
 
 
 def test_the_nearer_of_two_groups_counts_and_jumps_are_not_trusted() -> None:

@@ -5,6 +5,8 @@ import pytest
 
 from rigwake._types import Image
 from rigwake.errors import EstimationError
+from rigwake.views import height as height_module
+from rigwake.views.attitude import LevelAttitude
 from rigwake.views.colour import (
     ColourModel,
     ColourSamples,
@@ -14,7 +16,7 @@ from rigwake.views.colour import (
     half_field,
 )
 from rigwake.views.frames import FrameSet, place
-from rigwake.views.height import edges_below_things, height_from_contacts
+from rigwake.views.height import edges_below_things, estimate_height, height_from_contacts
 from rigwake.views.horizon import horizon_attitude
 from rigwake.views.ripples import height_of_ripples
 from rigwake.views.seam_blame import blame_cameras
@@ -199,3 +201,25 @@ def test_the_height_on_which_ripples_agree() -> None:
         height_of_ripples(np.concatenate([surface, 1.6 * surface[:4000]]))
     with pytest.raises(EstimationError, match="too little"):
         height_of_ripples(surface[:800])
+
+
+class Level:
+    """A leveller that knows the attitude."""
+
+    def at(self, timestamp_ns: int, images: object = None) -> LevelAttitude:
+        return STAND
+
+
+def test_why_the_ripples_tell_no_height_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    distance = np.linspace(5, 20, 200)
+    contacts = distance, np.arctan2(HEIGHT_M, distance)
+    monkeypatch.setattr(height_module, "ripple_heights", lambda *_: np.full(10, HEIGHT_M))
+    monkeypatch.setattr(height_module, "edges_below_things", lambda *_: contacts)
+    frames = frame_set({name: np.zeros((480, 640, 3), np.uint8) for name in RIG.names})
+    found = estimate_height(RIG, [frames], Level())  # type: ignore[arg-type]
+    assert not found.by_ripples
+    assert found.height_m == pytest.approx(HEIGHT_M, rel=0.01)
+    assert "too little of the water" in found.why_not_ripples
+    monkeypatch.setattr(height_module, "edges_below_things", lambda *_: (distance[:3], contacts[1][:3]))
+    with pytest.raises(EstimationError, match=r"too little of the water.*Only 3 level edges"):
+        estimate_height(RIG, [frames], Level())  # type: ignore[arg-type]

@@ -28,6 +28,9 @@ def command(
         typer.Option(help="Mean height of the cameras above the water, metres; default: estimated."),
     ] = None,
     nearest_m: Annotated[float, typer.Option(help="Nearest range that is looked for, metres.")] = 3.0,
+    sweep: Annotated[
+        bool, typer.Option("--sweep", help="Match all cameras at once on spheres: coarser, one pass.")
+    ] = False,
     topic: TopicOption = None,
     topics: TopicsOption = None,
     json_file: JsonOption = None,
@@ -56,6 +59,7 @@ def command(
             nearest_m,
             TopicMap.from_options(topic or (), topics),
             lambda done, total: bar.update(task, completed=done, total=total, description="matching"),
+            sweep,
         )
     if json_file is not None:
         write_json(json_file, result.as_dict())

@@ -46,12 +46,14 @@ _UNKNOWN_EDGES_STD = 0.12  # relative: which edge the mode stands for; measured 
 @dataclass(frozen=True)
 class HeightEstimate:
     """Height of the viewpoint (mean of the cameras) above the mean water, its standard deviation, and the number of
-    waterlines, or of points on ripples, it comes from (0: given)."""
+    waterlines, or of points on ripples, it comes from (0: given). why_not_ripples: a sentence, where those were tried
+    first."""
 
     height_m: float
     std_m: float
     contacts: int
     by_ripples: bool = False
+    why_not_ripples: str = ""
 
 
 def estimate_height(
@@ -62,7 +64,7 @@ def estimate_height(
 ) -> HeightEstimate:
     """The height that most ripples agree on, else the one that most waterlines agree on.
 
-    masks: of the own vessel, by camera name. Raises EstimationError if neither stands out.
+    masks: of the own vessel, by camera name. Raises EstimationError if neither stands out; it says why of both.
     """
     usable = [frames for frames in samples if (~frames.is_missing).sum() > 1]
     chosen = usable[:: max(len(usable) // _SETS, 1)][:_SETS]
@@ -73,16 +75,21 @@ def estimate_height(
     try:
         heights = [ripple_heights(images, rig, attitude, masks) for images, attitude in seen]
         height, points = height_of_ripples(np.concatenate(heights))
-    except EstimationError:
-        pass
+    except EstimationError as error:
+        why_not = error.cause
     else:
         return HeightEstimate(height, height * float(np.hypot(RIPPLES_STD, tilt / 0.3)), points, True)
     edges = [edges_below_things(images, rig, attitude) for images, attitude in seen]
-    found = height_from_contacts(*(np.concatenate([e[k] for e in edges]) for k in (0, 1)))
+    try:
+        found = height_from_contacts(*(np.concatenate([e[k] for e in edges]) for k in (0, 1)))
+    except EstimationError as error:
+        raise EstimationError(f"{why_not} {error.cause}", consequence=error.consequence) from error
     std = found.height_m * float(
         np.hypot(_UNKNOWN_EDGES_STD, tilt / 0.2)
     )  # edges are seen about 0.2 rad down
-    return HeightEstimate(found.height_m, float(np.hypot(std, found.std_m)), found.contacts)
+    return HeightEstimate(
+        found.height_m, float(np.hypot(std, found.std_m)), found.contacts, why_not_ripples=why_not
+    )
 
 
 def height_from_contacts(distance_m: Array, depression: Array) -> HeightEstimate:

@@ -287,10 +287,14 @@ def _height(
         found = estimate_height(rig, samples, leveller, masks)
     except EstimationError as error:
         return None, f"Height of the cameras above the water: not known. {error.cause}"
-    places = "points on its ripples" if found.by_ripples else "waterlines of what stands in it"
+    places = "points on its ripples." if found.by_ripples else "waterlines of what stands in it."
+    if found.why_not_ripples:
+        places += (
+            f" Its ripples tell nothing: {found.why_not_ripples[:1].lower() + found.why_not_ripples[1:]}"
+        )
     return found, (
         f"Height of the cameras above the water: {found.height_m:.2f} +- {found.std_m:.2f} m, "
-        f"estimated from {found.contacts} {places}."
+        f"estimated from {found.contacts} {places}"
     )
 
 

@@ -26,6 +26,7 @@ _TEXTURE = 4.0  # grey levels
 _HEIGHTS_M = (0.3, 60.0)
 _STEP = 0.01  # of the histogram of logarithms
 _KERNEL = 4.0  # steps, standard deviation
+_NARROW = 2.0
 _APART = 10  # steps between two peaks
 _LEAST_POINTS = 1500  # within the peak
 _SECOND = 0.5  # density of another peak, in densities of the first, beyond which neither is believed
@@ -65,4 +66,8 @@ def height_of_ripples(heights_m: Array) -> tuple[float, int]:
     others = others[np.abs(others - best) > _APART]
     if len(others) and density[others].max() > _SECOND * density[best]:
         raise EstimationError("What two cameras match near the vessel does not agree on one height.")
-    return float(np.exp(centre)), agreeing
+    # the wide kernel finds the right peak, but mirrored light under the surface draws it down; the narrow one less
+    near = logarithm[np.abs(logarithm - centre) < _APART * _STEP]
+    edges = np.arange(centre - _APART * _STEP, centre + _APART * _STEP, _STEP / 2)
+    density = cv2.GaussianBlur(np.histogram(near, edges)[0].astype(np.float64)[None], (0, 0), 2 * _NARROW)[0]
+    return float(np.exp(edges[int(density.argmax())] + _STEP / 4)), agreeing

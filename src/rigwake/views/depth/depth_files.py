@@ -66,11 +66,13 @@ def depth_to_folder(
     nearest_m: float = 3.0,
     topics: TopicMap | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    sweeps: bool = False,
 ) -> DepthSummary:
     """Write of every frame set `T.png` (16 bit), `T.npz`, `T.ply` and `T_colour.jpg`, T its time stamp.
 
     Pictures taken a little earlier are matched too where the way since is known. Without a known height above the
-    water, water has no range. Raises InputError or UsageError as `prepare_surround`.
+    water, water has no range. sweeps: as `matched_points`.
+    Raises InputError or UsageError as `prepare_surround`.
     """
     options = SurroundOptions(height_m=height_m, hull="mask", correct_colours=False)
     setup = prepare_surround(calibration, recording, options, topics)
@@ -88,7 +90,9 @@ def depth_to_folder(
         images, attitude = frames.images(setup.rig), setup.attitude_at(frames)
         surface = WaterAndShell(setup.shell_m) if setup.height else setup.surface_at(frames, attitude)
         strip = level_strip(images, setup.rig, attitude, surface, grid, setup.masks, frames.timestamp_ns)
-        points = matched_points(images, setup.rig, attitude, setup.masks, nearest_m, setup.earlier(frames))
+        points = matched_points(
+            images, setup.rig, attitude, setup.masks, nearest_m, setup.earlier(frames), sweeps
+        )
         labels = tested_by_height(segment_strip(strip, network), points, grid, attitude)
         depth = fuse_depth(points, labels, grid, attitude, frames.timestamp_ns)
         matched += int((depth.source == MATCHED).sum())

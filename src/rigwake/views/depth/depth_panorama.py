@@ -13,6 +13,7 @@ from rigwake._types import Array, Image, Mask
 from rigwake.views.attitude import LevelAttitude
 from rigwake.views.depth.epipolar import MatchedPoints, epipolar_pairs, match_pair
 from rigwake.views.depth.motion import Earlier, moved_points
+from rigwake.views.depth.sweep import swept_points
 from rigwake.views.scene.segmentation import OBSTACLE, WATER, Labels
 from rigwake.views.strips import StripGrid
 from rigwake.views.surface import SHELL_M, WaterAndDepth
@@ -62,11 +63,18 @@ def matched_points(
     masks: Mapping[str, Mask] | None = None,
     nearest_m: float = 3.0,
     earlier: Earlier | None = None,
+    sweeps: bool = False,
 ) -> list[MatchedPoints]:
-    """What every two cameras of a frame set see in common, and with `earlier` what each sees now and saw then."""
-    found = [
-        match_pair(pair, images, rig, attitude, masks, nearest_m) for pair in epipolar_pairs(rig, attitude)
-    ]
+    """What every two cameras of a frame set see in common, and with `earlier` what each sees now and saw then.
+
+    sweeps: a sweep of spheres in place of matching every two cameras: one pass, in coarser steps.
+    """
+    found: list[MatchedPoints | None]
+    if sweeps:
+        found = [swept_points(images, rig, attitude, masks, nearest_m)]
+    else:
+        pairs = epipolar_pairs(rig, attitude)
+        found = [match_pair(pair, images, rig, attitude, masks, nearest_m) for pair in pairs]
     by_motion = [] if earlier is None else moved_points(images, earlier, rig, attitude, masks, nearest_m)
     return [points for points in found if points is not None] + by_motion
 

@@ -26,6 +26,7 @@ _BELOW_DEG = 0.6  # of elevation: higher up the plane is too far away
 _CLEARLY = 2.0  # standard deviations
 _UNDER_NATS, _OVER_NATS = 3.0, 2.5  # the most that points under and over the water say
 _UNMATCHED_NATS = 1.0  # the most that textured places say which two cameras see and do not match
+_PLANE_NATS = 0.7  # the most that points in the plane say about the far edge of the water
 _AROUND_PX = 1.4  # standard deviation of the window
 _FEW = 1.0  # points per pixel that say as much as nothing
 _STANDS = 0.35  # balance from which a pixel stands on what is under it
@@ -64,6 +65,14 @@ class PlaneEvidence:
         """0..1: of what was tried, what was matched neither over the plane nor in it nor under it."""
         found = self.over + self.near + self.under
         return np.asarray((self.tried - found).clip(0) / (self.tried + _FEW), np.float32)
+
+    def in_plane(self, grid: StripGrid, height_m: float) -> Floats:
+        """0..1: of what was matched, what lies in the plane, where a row is so high that an upright thing would clearly
+        rise above it from one row to the next: the far edge of the water."""
+        down = np.tan(np.maximum(-grid.elevations(), 1e-3))
+        rise = height_m / down * np.deg2rad(grid.step_deg)
+        share = self.near / (self.over + self.near + self.under + _FEW)
+        return np.where((rise > _WAVES_M)[:, None], share, 0).astype(np.float32)
 
     def standing(self) -> NDArray[np.bool_]:
         """Pixels over the water that reach down to it without a gap. What is matched by chance floats."""
@@ -128,6 +137,7 @@ def tested_by_height(
     balance, standing = evidence.balance, evidence.standing()
     change = np.where(balance < 0, _UNDER_NATS * balance, np.where(standing, _OVER_NATS * balance, 0))
     change -= np.where(standing, 0, _UNMATCHED_NATS * evidence.unmatched)
+    change -= np.where(standing, 0, _PLANE_NATS * evidence.in_plane(grid, attitude.height_m))
     logarithm = np.log(np.maximum(labels.probability, 1e-4))
     logarithm[OBSTACLE] += change
     return without_ghosts(_relabelled(labels, logarithm), labels, evidence, grid)
