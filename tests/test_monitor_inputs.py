@@ -5,24 +5,26 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from monitor_worlds import Watch, watch
-from rigwake.calibration import UnobservableDirection, load_calibration, save_calibration
+from rigwake.calibration import Calibration, UnobservableDirection, load_calibration, save_calibration
 from rigwake.cli.log import parse_time
 from rigwake.cli.main import build_app
 from rigwake.errors import InputError, UnobservableError, UsageError
 from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.logbook.store import Logbook
+from rigwake.monitor.kept_result import recalibrate_with_log
 from rigwake.monitor.knocks import knocks_inside
 from rigwake.monitor.monitor_page import render_page
 from rigwake.monitor.monitor_report import logged_verdicts, result_to_dict, verdict_line
-from rigwake.monitor.recalibration import _shift, recalibrate
-from rigwake.monitor.run import monitor
+from rigwake.monitor.recalibration import Recalibration, _shift, recalibrate
+from rigwake.monitor.run import CameraVerdict, monitor
 from rigwake.monitor.states import CameraState
 from rigwake.monitor.thresholds import Thresholds
 from rigwake.monitor.vessel_rig import prepare_rig
@@ -121,6 +123,53 @@ def test_standstill_tells_axes_and_what_would_help() -> None:
         assert "what helps: sailing" in verdict.words
     assert result_to_dict(result)["cues"]["overlap"]["words"] == "overlap: saw nothing"
     assert all(cue.words in render_page(result, still.recording) for cue in result.cues.values())
+
+
+def test_the_logbook_follows_a_recalibration(
+    world: Watch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """RECALIBRATING while a camera is measured; then the new calibration is in force and OK, or all is as before."""
+    log, starts = tmp_path / "vessel.db", np.array([10**10, 2 * 10**10, 3 * 10**10])
+    drifted = CameraVerdict("left", CameraState.DRIFTED, np.full(3, 0.02), "0.50 ± 0.02 deg (step)")
+    judgement = SimpleNamespace(
+        alarms=(
+            SimpleNamespace(
+                camera="left",
+                explanations=(SimpleNamespace(cause="rotation"),),
+                change=SimpleNamespace(kind="step"),
+            ),
+        ),
+        scores=SimpleNamespace(starts_ns=starts),
+    )
+    result: Any = SimpleNamespace(verdicts={"left": drifted}, blamed=("left",), judgement=judgement)
+    monkeypatch.setattr("rigwake.monitor.recalibration._blamed", lambda r: ("left", r.judgement.alarms[0]))
+
+    def states() -> list[str]:
+        with Logbook(log) as book:
+            return [v.state for v in book.verdicts("left")]
+
+    def refused(*_: object) -> Recalibration:
+        assert states()[-1] == "RECALIBRATING"
+        raise UnobservableError("Too little motion.")
+
+    def measured(*_: object) -> Recalibration:
+        assert states()[-1] == "RECALIBRATING"
+        left = replace(world.calibration.cameras["left"], time_offset_std_s=0.5)
+        new = replace(world.calibration, cameras={**world.calibration.cameras, "left": left})
+        return Recalibration(new, "left", np.zeros(3), np.eye(3) * 1e-8, 3, np.zeros(3), int(starts[1]))
+
+    written: list[Calibration] = []
+    monkeypatch.setattr("rigwake.monitor.kept_result.recalibrate", refused)
+    with pytest.raises(UnobservableError):
+        recalibrate_with_log(world.calibration, world.recording, result, log, written.append)
+    assert states() == ["RECALIBRATING", "DRIFTED"]
+    assert not written
+    monkeypatch.setattr("rigwake.monitor.kept_result.recalibrate", measured)
+    recalibrate_with_log(world.calibration, world.recording, result, log, written.append)
+    assert states()[2:] == ["RECALIBRATING", "OK"]
+    with Logbook(log) as book:
+        assert [entry.supersedes for entry in book.calibrations()] == [None, 1]
+        assert book.verdicts("left")[-1].calibration_id == book.at(int(starts[1])).id == 2
 
 
 @pytest.mark.slow

@@ -161,8 +161,9 @@ def test_states() -> None:
         assert suspect.state is CameraState.SUSPECT
     assert after(suspect, thresholds.calm - 1).state is CameraState.OK
     assert after(ok, 0.0, observable=False).state is CameraState.UNOBSERVABLE
-    assert recalibrated(recalibrating(drifted)).state is CameraState.OK
-    assert recalibrating(ok) == ok
+    assert recalibrating(drifted.state) is CameraState.RECALIBRATING
+    assert recalibrated(recalibrating(drifted.state)) is CameraState.OK
+    assert recalibrated(recalibrating(ok.state)) is CameraState.OK
 
 
 def test_thresholds_must_rise() -> None:

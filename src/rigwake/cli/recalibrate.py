@@ -43,11 +43,11 @@ def command(
     require_writable("--json", json_file)
     import numpy as np
 
-    from rigwake.calibration import load_calibration, save_calibration
+    from rigwake.calibration import Calibration, load_calibration, save_calibration
     from rigwake.calibration.yaml_file import plain
     from rigwake.errors import UsageError
     from rigwake.evaluation.rig_errors import compare_calibrations
-    from rigwake.logbook.store import Logbook
+    from rigwake.monitor.kept_result import recalibrate_with_log
     from rigwake.monitor.recalibration import recalibrate
     from rigwake.monitor.run import monitor
     from rigwake.readers.open import open_recording
@@ -59,16 +59,16 @@ def command(
     opened = open_recording(recording, TopicMap.from_options(topic or (), topics, camera_file or ()))
     with progress_bars() as bars:
         result = monitor(old, opened, bars)
-    found = recalibrate(old, result)
-    save_calibration(found.calibration, new)
+    if log is None:
+        found = recalibrate(old, result)
+        save_calibration(found.calibration, new)
+    else:
+
+        def save(calibrated: Calibration) -> None:
+            save_calibration(calibrated, new)
+
+        found = recalibrate_with_log(old, opened, result, log, save, note=calibration.name)
     difference = compare_calibrations(old, found.calibration, [20.0])[found.camera]
-    if log is not None:
-        since = found.since_ns
-        with Logbook(log, create=True) as book:
-            if book.find(old) is None:
-                begin = min(int(c.timestamps_ns[0]) for c in opened.cameras.values() if len(c))
-                book.add(old, min(begin, since - 1), note=calibration.name)
-            book.add(found.calibration, since, note=f"{found.camera} recalibrated from {recording.name}")
     if json_file is not None:
         content = {"camera": found.camera, "blocks": found.blocks, "difference": difference.to_json()}
         write_json(json_file, plain(content))

@@ -26,6 +26,8 @@ from rigwake.rig import Rig
 from rigwake.tracks import CrossViews
 
 CUES = ("ego-motion", "overlap", "landmarks")
+HORIZON = "horizon"  # from pictures alone, beside those
+_SUSPECT_BLOCKS = 3
 _LIVELY_RATE = np.deg2rad(15.0)  # rad/s
 
 
@@ -96,7 +98,8 @@ def weighted_cues(cues: Mapping[str, BlockScores]) -> dict[str, BlockScores]:
             rows=scores.rows * counts[:, None],
         )
         more = size - scores.H.shape[1]
-        spread = spreads(scores)
+        # the horizon's covariance is its scatter from block to block already
+        spread = np.ones((*scores.rows.shape, 3)) if name == HORIZON else spreads(scores)
         scores = weighted(discount_wrong_motion(scores) if name == CUES[0] else scores, spread)
         own[name] = replace(
             scores,
@@ -132,6 +135,23 @@ def cue_series(
         words = _words(name, scores, statistics, thresholds)
         series[name] = CueSeries(name, statistics.value, statistics.std_deg, words)
     return series
+
+
+def horizon_suspects(series: CueSeries, scores: BlockScores, thresholds: Thresholds) -> dict[str, str]:
+    """Cameras whose horizon has long been far elsewhere than that of the others, and words on each.
+
+    For cameras of which the motion tells nothing. A shore that comes into view looks the same: this is no blame.
+    """
+    recent = series.value[-_SUSPECT_BLOCKS:]
+    if len(recent) < _SUSPECT_BLOCKS:
+        return {}
+    least = recent.min(axis=0)
+    apart = (least >= thresholds.alone) & (least >= least.max() / 2)
+    words = (
+        f"its horizon moved against that of the others for {_SUSPECT_BLOCKS * BLOCK_S:.0f} s and more: "
+        "it turned, or a shore came into view; what helps: sailing at 1 m/s or more, with turns"
+    )
+    return {scores.cameras[c]: words for c in np.flatnonzero(apart).tolist()}
 
 
 def _words(name: str, scores: BlockScores, statistics: BlockStatistics, thresholds: Thresholds) -> str:

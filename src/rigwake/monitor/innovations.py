@@ -24,6 +24,11 @@ _BIAS_BLOCKS, _FEWEST_BIASES = 12, 3  # whose gyro bias a block's is held agains
 _BIAS_SURE = 2.0  # standard deviations as the blocks tell them, up to which biases agree
 
 
+def horizon_columns(cameras: int) -> int:
+    """Where the constants of the cameras' lines begin in the scores: behind the offsets of pairs, three a camera."""
+    return MOUNTING * cameras + 3 * (cameras * (cameras - 1) // 2)
+
+
 @dataclass(frozen=True, eq=False)
 class Belief:
     """Corrections (7C,) of a calibration that are likely, and their covariance (7C, 7C), in rig axes."""
@@ -97,10 +102,13 @@ def belief_of(calibration: Calibration, cameras: tuple[str, ...], thresholds: Th
 
 
 def with_offsets(belief: Belief, size: int, thresholds: Thresholds) -> Belief:
-    """The same with the offsets of pairs of cameras behind, up to `size` columns, as large as lenses leave them."""
+    """The same with what may be off for good behind, up to `size` columns: between pairs of cameras, as lenses leave
+    it, and the horizon's line of each camera, as shores leave it."""
     known = len(belief.mean)
     covariance = np.eye(size) * np.deg2rad(thresholds.offset_deg) ** 2
     covariance[:known, :known] = belief.covariance
+    lines = slice(horizon_columns(known // MOUNTING), None)
+    covariance[lines, lines] *= (thresholds.line_deg / thresholds.offset_deg) ** 2
     return Belief(np.concatenate([belief.mean, np.zeros(size - known)]), covariance)
 
 
@@ -261,8 +269,9 @@ def _updated(
         turns = scores.columns(c)
         least[turns] = np.maximum(floor**2 - np.diag(covariance)[turns], 0.0)
     offsets = slice(MOUNTING * len(scores.cameras), None)
-    still = np.deg2rad(thresholds.offset_floor_deg) ** 2
-    least[offsets] = np.maximum(still - np.diag(covariance)[offsets], 0.0)
+    still = np.full(len(g), np.deg2rad(thresholds.offset_floor_deg) ** 2)
+    still[horizon_columns(len(scores.cameras)) :] = np.deg2rad(thresholds.line_floor_deg) ** 2
+    least[offsets] = np.maximum(still - np.diag(covariance), 0.0)[offsets]
     return Belief(mean, covariance + np.diag(least))
 
 

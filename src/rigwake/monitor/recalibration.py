@@ -58,7 +58,7 @@ def recalibrate(calibration: Calibration, result: MonitorResult) -> Recalibratio
     change goes on (ramp); UnobservableError where the rest of the recording does not show the rotation well enough, or
     not where a camera is that shifted.
     """
-    name, alarm = _shifted_camera(result) or _blamed(result)
+    name, alarm = _measured_camera(result)
     begin, turned = (
         (alarm.since, np.zeros(3)) if alarm.change is None else (alarm.change.block, alarm.change.rotation)
     )
@@ -112,6 +112,15 @@ def recalibrate(calibration: Calibration, result: MonitorResult) -> Recalibratio
         },
     )
     return Recalibration(new, name, in_rig, covariance, len(starts), shift, since_ns)
+
+
+def camera_to_measure(result: MonitorResult) -> str:
+    """The one camera that turned or shifted. Raises as `recalibrate` where there is no such one."""
+    return _measured_camera(result)[0]
+
+
+def _measured_camera(result: MonitorResult) -> tuple[str, Alarm]:
+    return _shifted_camera(result) or _blamed(result)
 
 
 def _shifted_camera(result: MonitorResult) -> tuple[str, Alarm] | None:

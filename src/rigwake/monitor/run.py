@@ -15,7 +15,8 @@ from rigwake.geometry import so3
 from rigwake.geometry.se3 import SE3
 from rigwake.monitor.change_detection import Change
 from rigwake.monitor.cross_search import find_cross_views
-from rigwake.monitor.cues import CueSeries, cue_series, fuse, score_cues
+from rigwake.monitor.cues import HORIZON, CueSeries, cue_series, fuse, horizon_suspects, score_cues
+from rigwake.monitor.horizon_cue import look_at_horizon, score_horizon
 from rigwake.monitor.hull_edges import HullCue, hull_cues
 from rigwake.monitor.innovations import belief_of
 from rigwake.monitor.judge import Alarm, Judgement, judge_cues
@@ -137,6 +138,9 @@ def monitor(
     progress("monitor", "looking for what two cameras see", 0.3)
     views = find_cross_views(tracks, monitored.streams, monitored.rig, motion, motions)
     by_cue = score_cues(scores, motions, views, monitored.rig, motion)
+    own_hulls = {name: picture.region for name, picture in (hull or {}).items()}
+    lines = look_at_horizon(monitored.streams, monitored.rig, motion, starts, own_hulls)
+    by_cue[HORIZON] = score_horizon(lines, scores)
     belief = belief_of(monitored.calibration, scores.cameras, thresholds)
     up = scores.gravity.mean(axis=0)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0.0, 0.0, 1.0])
@@ -154,6 +158,9 @@ def monitor(
     verdicts, words = with_hull(verdicts, on_deck, monitored.rig_from_imu.rotation)
     notes += words
     cues = cue_series(by_cue, belief, thresholds)
+    for name, why in horizon_suspects(cues[HORIZON], scores, thresholds).items():
+        if verdicts[name].state is CameraState.UNOBSERVABLE:
+            verdicts[name] = replace(verdicts[name], state=CameraState.SUSPECT, words=why)
     return MonitorResult(
         verdicts, judgement, monitored, motion, tracks, tuple(notes), thresholds, on_deck, cues
     )

@@ -37,7 +37,7 @@ def next_standing(
     statistic passes the alarm within one block skips the suspicion; a suspicion ends after some quiet blocks.
     """
     state = before.state
-    if state in (CameraState.DRIFTED, CameraState.RECALIBRATING):
+    if state is CameraState.DRIFTED:
         return before
     if statistic >= thresholds.alarm and blamed:
         return Standing(CameraState.DRIFTED)
@@ -50,11 +50,12 @@ def next_standing(
     return Standing(quiet)
 
 
-def recalibrating(before: Standing) -> Standing:
-    """A drifted camera whose new mounting is being measured."""
-    return Standing(CameraState.RECALIBRATING) if before.state is CameraState.DRIFTED else before
+def recalibrating(state: CameraState) -> CameraState:
+    """Of a camera that drifted, or that is suspected of a shift, while its new mounting is measured."""
+    measured = state in (CameraState.DRIFTED, CameraState.SUSPECT)
+    return CameraState.RECALIBRATING if measured else state
 
 
-def recalibrated(before: Standing) -> Standing:
-    """A camera whose new mounting is in force."""
-    return Standing(CameraState.OK) if before.state is CameraState.RECALIBRATING else before
+def recalibrated(state: CameraState) -> CameraState:
+    """Of a camera whose new mounting is in force."""
+    return CameraState.OK if state is CameraState.RECALIBRATING else state

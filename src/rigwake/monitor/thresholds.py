@@ -19,8 +19,10 @@ class Thresholds:
     larger standard deviation over the longest window is not observable. shortest, longest: blocks of a window;
     steady_lag: blocks that what was steady before is away from it.
     floor_deg: systematic error that no amount of data takes away. offset_deg: by how much lenses let two cameras
-    disagree where their pictures overlap; offset_floor_deg: how much of that may change over minutes. support: log
-    likelihood that the motion alone must add to what all cues together say of a camera.
+    disagree where their pictures overlap; offset_floor_deg: how much of that may change over minutes. line_deg,
+    line_floor_deg: the same of each camera's horizon, which may be a shore. alone: the horizon's own ratio, above which
+    a camera is suspect where its motion tells nothing. support: log likelihood that the motion alone must add to what
+    all cues together say of a camera.
     calm_blocks: quiet blocks that end a suspicion. patience: blocks that blame may take.
     """
 
@@ -36,6 +38,9 @@ class Thresholds:
     floor_deg: float = 0.005
     offset_deg: float = 0.03
     offset_floor_deg: float = 0.01
+    line_deg: float = 1.0
+    line_floor_deg: float = 0.03
+    alone: float = 90.0
     support: float = 2.0
     calm_blocks: int = 3
     patience: int = 3
