@@ -27,7 +27,6 @@ from rigwake.geometry.se3 import SE3, covariance_in_axes_of_a
 from rigwake.handeye.handeye_problem import HandeyeOptions
 from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.handeye.motions import TrajectoryCurve
-from rigwake.pipeline.handeye_run import run_handeye
 from rigwake.readers.trajectories import read_trajectory
 from rigwake.trajectory import Trajectory
 
@@ -256,7 +255,7 @@ def pair_errors(folder: Path, name: str) -> list[tuple[np.ndarray, np.ndarray]]:
     both = {n: read_trajectory(folder / name / f"{n}.tum", name=n).trajectory for n in (reference, member)}
     found = []
     for one, other, true in ((reference, member, known), (member, reference, known.inverse())):
-        camera = run_handeye(both[one], [both[other]], HandeyeOptions())[0].members[other]
+        camera = calibrate_handeye(both[one], [both[other]]).members[other]
         turned = np.rad2deg(so3.log(camera.rig_from_cam.rotation @ true.rotation.T))
         shifted = 1e3 * (camera.rig_from_cam.translation - true.translation)
         std = np.concatenate([camera.std_rotation_deg, 1e3 * np.asarray(camera.std_translation_m)])

@@ -1,4 +1,4 @@
-"""Hand-eye: what changes during a recording is named; a scale that is some percent off is estimated."""
+"""Hand-eye: what changes during a recording is named, and lengths that no odometry errs by."""
 
 from dataclasses import replace
 
@@ -39,23 +39,6 @@ def test_good_pairs_are_not_accused(motion, seed: int) -> None:
     assert check_steadiness(rig, port, result) == ()
 
 
-def test_a_scale_some_percent_off_is_estimated_and_said() -> None:
-    rig, port = pair()
-    port = replace(port, world_from_body=scaled(port.world_from_body, 1.05))
-    result, checks, _ = run_handeye(rig, [port], HandeyeOptions())
-    assert [c.action for c in checks] == ["none", "repaired"]
-    assert "1.05" in checks[1].hypothesis
-    off = result.ref_from_members["port"].translation - PORT.translation
-    assert np.linalg.norm(off) < 0.05
-    assert result.scales["port"][0][0] == pytest.approx(1 / 1.05, abs=0.005)
-
-
-def test_a_right_scale_is_left_alone() -> None:
-    result, checks, _ = run_handeye(*_and_list(pair()), HandeyeOptions())
-    assert len(checks) == 1
-    assert len(result.scales.get("port", ())) == 0
-
-
 def test_lengths_half_as_long_again_are_refused() -> None:
     rig, port = pair()
     port = replace(port, world_from_body=scaled(port.world_from_body, 1.5))
@@ -90,7 +73,3 @@ def test_a_frozen_pose() -> None:
 
 def scaled(poses: SE3, factor: float) -> SE3:
     return SE3(poses.rotation, factor * poses.translation)
-
-
-def _and_list(both: tuple[Trajectory, Trajectory]) -> tuple[Trajectory, list[Trajectory]]:
-    return both[0], [both[1]]

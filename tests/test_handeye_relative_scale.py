@@ -39,20 +39,10 @@ def nees(scale: float, seed: int) -> float:
 
 def test_a_scale_that_is_off_counts_as_uncertainty_and_is_told():
     assert np.mean([nees(1.03, seed) for seed in range(6)]) < 12  # 6 is expected
-    rig, port = pair(1.015, 1)
-    *_, (finding,) = run_handeye(rig, [port], HandeyeOptions(time_offset=False))
-    assert "rig goes 1." in finding.message
-    assert "less far" in finding.message
-
-
-def test_an_evident_scale_is_estimated():
     rig, port = pair(1.03, 1)
-    result, (_, check), noticed = run_handeye(rig, [port], HandeyeOptions(time_offset=False))
-    assert "its lengths are 1.03" in check.hypothesis
-    assert check.action == "repaired"
-    assert noticed == ()
-    off = PORT.local(result.ref_from_members["port"])
-    assert off @ np.linalg.solve(result.joint_covariance, off) < 18  # of 6
+    *_, (finding,) = run_handeye(rig, [port], HandeyeOptions(time_offset=False))
+    assert "rig goes 2.9" in finding.message
+    assert "less far" in finding.message
 
 
 def test_equal_scales_widen_nothing():

@@ -1,7 +1,7 @@
-"""Whether a mounting, a time offset and a unit of length stay what they are for a whole recording.
+"""Whether a mounting and a time offset stay what they are for a whole recording.
 
-Hand-eye calibration finds one mounting, one time offset and no scale. Where a body was moved halfway, where its clock
-runs at another rate, or where its lengths are a few percent off, one value for all is wrong; robust weights hide it.
+Hand-eye calibration finds one mounting and one time offset. Where a body was moved halfway or where its clock runs at
+another rate, one value for all is wrong; robust weights hide it.
 Over strides of seconds the residual `log(B^-1 X^-1 A X)` is linear in a small change of the mounting (six numbers), of
 the time offset and of the scale; normal equations per block of ten seconds tell how these change. Noise is the
 scatter between neighbouring blocks, which a change between halves does not widen.
