@@ -9,6 +9,8 @@ from typing import Any
 
 # one worker per core runs already: more threads would only wait for each other, also in processes that tests start
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# as the program does before it imports numba; a test may import that first
+os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
 import pytest
 from hypothesis import HealthCheck, settings

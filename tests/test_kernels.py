@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import pytest
 from numba.core.caching import IndexDataCacheFile
 
 from rigwake._kernels import KernelFile, njit
+from rigwake.kernel_cache import speed_up_compilation
 
 
 def save_at_once(kind: type[IndexDataCacheFile], folder: Path) -> IndexDataCacheFile:
@@ -79,3 +82,11 @@ def test_every_kernel_of_the_package_is_compiled_so() -> None:
     sources = (Path(__file__).parent.parent / "src" / "rigwake").rglob("*.py")
     wrong = [p.name for p in sources if p.name != "_kernels.py" and "cache=True" in p.read_text()]
     assert not wrong
+
+
+def test_failed_guesses_of_types_are_not_coloured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING")  # set when the package was imported
+    speed_up_compilation()
+    program = "import rigwake; from numba.core import errors; print(type(errors.termcolor()).__name__)"
+    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert printed.stdout.strip() == "NOPColorScheme"

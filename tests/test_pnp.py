@@ -87,3 +87,13 @@ def test_refuses_what_cannot_work():
         pnp.absolute_pose(points[:2], bearings[:2], **gates)
     with pytest.raises(EstimationError, match="finite"):
         pnp.absolute_pose(points, bearings * np.nan, **gates)
+
+
+def test_a_damped_step_solves_the_normal_equations():
+    rng = np.random.default_rng(5)
+    for damping in (0.0, 1e-6, 10.0):
+        jacobian, gradient = rng.normal(size=(12, 6)) * np.logspace(0, 3, 6), rng.normal(size=6)
+        matrix = jacobian.T @ jacobian
+        damped = matrix + damping * np.diag(np.diag(matrix) + 1e-12)
+        expected = -np.linalg.solve(damped, gradient)
+        np.testing.assert_allclose(pnp._damped_step(matrix, gradient, damping), expected, rtol=1e-8)

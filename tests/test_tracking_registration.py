@@ -10,7 +10,7 @@ from rigwake.geometry import so3
 from rigwake.tracking.interpolation import sample, sample_with_gradient, spline_coefficients
 from rigwake.tracking.references import PatchShape, make_references
 from rigwake.tracking.registration import register
-from rigwake.tracking.warps import dominant_rotation, rotation_warps, stencil_bearings
+from rigwake.tracking.warps import _nearest_rotation, dominant_rotation, rotation_warps, stencil_bearings
 from tracking_scene import fisheye
 
 SHAPE = PatchShape.disc(8)
@@ -172,3 +172,19 @@ def test_dominant_rotation_outvotes_a_third_that_moves_otherwise(turn, seed):
     found = dominant_rotation(before, after)
     assert np.linalg.norm(so3.log(found.T @ rotation)) < 2e-3
     np.testing.assert_array_equal(dominant_rotation(np.empty((0, 3)), np.empty((0, 3))), np.eye(3))
+
+
+@pytest.mark.parametrize("kind", ["any", "mirrored", "of two bearings", "nothing"])
+def test_the_nearest_rotation_is_that_of_the_singular_values(kind):
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        moment = rng.normal(size=(3, 3)) if kind != "nothing" else np.zeros((3, 3))
+        if kind == "mirrored":
+            moment *= -np.sign(np.linalg.det(moment))
+        if kind == "of two bearings":
+            moment = rng.normal(size=(3, 2)) @ rng.normal(size=(2, 3))
+        found = np.full((3, 3), np.nan)
+        _nearest_rotation(moment, found)
+        u, _, vt = np.linalg.svd(moment)
+        u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)
+        np.testing.assert_allclose(found, u @ vt, atol=1e-9)
