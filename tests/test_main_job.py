@@ -40,7 +40,6 @@ from rigwake.writers.write import write_recording
 
 pytestmark = pytest.mark.xdist_group("basin")
 CHI_SQUARE_6 = 22.5  # 99.9 %
-SETTINGS = ("tracking.max_features=250",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +60,7 @@ def sail(tmp_path_factory: pytest.TempPathFactory) -> Sail:
     write_recording(recording, folder / "rec")
     with pytest.MonkeyPatch.context() as patch:
         inputs = _noted(patch)
-        run = calibrate(folder / "rec", folder / "out", load_config(None, SETTINGS, jobs=1))
+        run = calibrate(folder / "rec", folder / "out", load_config(jobs=1))
     truth = rig_in_frame(simulated.rig, run.calibration.reference)
     return Sail(
         recording, folder / "rec", run, inputs[0], truth, evaluate_calibration(run.calibration, truth)
@@ -250,7 +249,7 @@ class TestResume:
             calibrate(
                 sail.path,
                 sail.run.out,
-                load_config(None, SETTINGS, jobs=1),
+                load_config(jobs=1),
                 resume=True,
                 run_cameras=refuse,
             )
@@ -275,7 +274,7 @@ class TestResume:
         def note(*_: object, **__: object) -> None:
             raise TrackedError
 
-        config = load_config(None, (*SETTINGS, setting), jobs=1)
+        config = load_config(None, (setting,), jobs=1)
         with pytest.raises(TrackedError):
             calibrate(sail.path, sail.run.out, config, resume=True, run_cameras=note)
 

@@ -23,6 +23,7 @@ from rigwake.geometry.se3 import SE3
 from rigwake.report import build_report, load_report_content, summary_lines
 from rigwake.report.charts import Series, line_chart, ticks
 from rigwake.report.extrinsics import directions, looks, two_digits
+from rigwake.report.figures import write_figures
 from rigwake.report.motion_figures import motion_of, paths_in_one_world
 from rigwake.report.picture_overlays import BUDGET_BYTES
 from rigwake.report.report_page import render
@@ -352,8 +353,6 @@ def test_a_chart_breaks_its_line_where_there_is_no_number() -> None:
 
 @pytest.mark.parametrize("file_format", ["png", "svg"])
 def test_figures_for_papers(folder: Path, tmp_path: Path, file_format: str) -> None:
-    from rigwake.report.figures import write_figures  # with matplotlib, which takes its time
-
     files = write_figures(load_report_content(folder), tmp_path, file_format)
     names = ["rig", "paths", "residuals_angle", "residuals_time", "sigmas"]
     assert [f.stem for f in files] == names
