@@ -31,7 +31,7 @@ from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
 _UNRELATED = 0.5  # of a camera's turns that the gyroscope does not explain
-_WELL_EXPLAINED = 0.05
+_WELL_EXPLAINED, _FAR_WORSE = 0.05, 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,12 +233,13 @@ def _fit_all(
 def _odd_ones(fits: Mapping[str, TurnFit]) -> dict[str, float]:
     """Cameras a good part of whose turns the gyroscope does not explain although it explains all of the others'."""
     left = {name: fit.unexplained for name, fit in fits.items()}
-    others = {name: [x for n, x in left.items() if n != name] for name in left}
-    return {
-        name: x
-        for name, x in left.items()
-        if x > EXPLAINED and others[name] and float(np.median(others[name])) < _WELL_EXPLAINED
-    }
+    found = {}
+    for name, figure in left.items():
+        others = [x for other, x in left.items() if other != name]
+        usual = float(np.median(others)) if others else 1.0
+        if usual < _WELL_EXPLAINED and figure > max(EXPLAINED, _FAR_WORSE * usual):
+            found[name] = figure
+    return found
 
 
 def _rate(imu: ImuStream, trajectory: Trajectory, unexplained: float) -> float | None:
