@@ -114,8 +114,9 @@ def colour_rows(folder: Path) -> None:
     track = track_from_trajectory(read_trajectory(folder / "truth_base.tum").trajectory, rig)
     track = track.with_height(_HEIGHT_M, 0.02)
     times = output_times(streams, rig)
-    chosen = times[np.minimum([*_FITTED, *_JUDGED], len(times) - 1)]
-    sets = list(frame_sets(streams, rig, chosen))
+    sets = [f for half in (_FITTED, _JUDGED) for f in frame_sets(streams, rig, times[list(half)])]
+    lost = [name for frames in sets for name in frames.missing]
+    assert not lost, f"frame sets lack {lost}"
     stands = [track.at(frames.timestamp_ns) for frames in sets]
     gains = np.random.default_rng(4).uniform(0.7, 1.3, (len(rig), 3))
     unequal = [exposed(f, rig, gains, np.array([0.1, -0.5, 0.1])) for f in sets]

@@ -37,6 +37,7 @@ from rigwake.views.depth.depth_panorama import (
 )
 from rigwake.views.depth.height_check import tested_by_height
 from rigwake.views.depth.motion import Earlier
+from rigwake.views.depth.persistence import earlier_looks
 from rigwake.views.height import estimate_height
 from rigwake.views.scene.label_measures import LabelComparison, flat_horizon
 from rigwake.views.scene.network import shipped_network
@@ -78,7 +79,10 @@ def estimate(rig: SurroundRig, shot: ViewShot, classifier: PixelClassifier, by_m
     alone = segment_strip(strip, classifier)
     earlier = Earlier(shot.images_before, shot.rig_from_rig_before) if by_motion else None
     matched = matched_points(shot.images, rig, attitude, shot.hulls, earlier=earlier)
-    labels = tested_by_height(alone, matched, GRID, attitude)
+    before = None
+    if earlier is not None:
+        before = earlier_looks(earlier, rig, attitude, surface, GRID, classifier, shot.hulls)
+    labels = tested_by_height(alone, matched, GRID, attitude, before)
     depth = fuse_depth(matched, labels, GRID, attitude)
     swept = matched_points(shot.images, rig, attitude, shot.hulls, sweeps=True)
     true_labels = labels_drawn(rig, shot, strip)

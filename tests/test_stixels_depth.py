@@ -16,6 +16,7 @@ from rigwake.views.depth.depth_files import point_cloud
 from rigwake.views.depth.depth_panorama import MATCHED, PLANE, fuse_depth, matched_points
 from rigwake.views.depth.epipolar import MatchedPoints, _semi_global, epipolar_pairs
 from rigwake.views.depth.motion import Earlier, earlier_time, moved_points
+from rigwake.views.depth.persistence import EarlierLooks
 from rigwake.views.depth.sgm import match_around
 from rigwake.views.depth.sweep import SWEEP_GRID, swept_points
 from rigwake.views.scene.segmentation import Labels
@@ -294,19 +295,19 @@ def labels_with(wrong: int, first: int, last: int) -> Labels:
 def test_what_lies_under_the_water_is_a_mirror_image() -> None:
     stand = attitude()  # 10 degrees down the water is 10.7 m away
     labels = labels_with(1, 98, 103)
-    corrected = height_check.tested_by_height(labels, [patch(98, 103, 30.0)], GRID, stand)
+    corrected = height_check.tested_by_height(labels, [patch(98, 103, 30.0)], GRID, stand, None)
     assert (corrected.classes[100, 205:255] == 0).all()
     unknown = LevelAttitude(stand.level_from_rig)
-    assert height_check.tested_by_height(labels, [patch(98, 103, 30.0)], GRID, unknown) is labels
+    assert height_check.tested_by_height(labels, [patch(98, 103, 30.0)], GRID, unknown, None) is labels
 
 
 def test_what_reaches_down_to_the_water_stands_and_what_floats_is_chance() -> None:
     stand, distance = attitude(), 5.0
     foot = round(float((GRID.top_deg + np.rad2deg(np.arctan(HEIGHT_M / distance))) / GRID.step_deg))
     labels = labels_with(0, 98, foot)
-    standing = height_check.tested_by_height(labels, [patch(98, foot, distance)], GRID, stand)
+    standing = height_check.tested_by_height(labels, [patch(98, foot, distance)], GRID, stand, None)
     assert (standing.classes[100:110, 205:255] == 1).all()
-    floating = height_check.tested_by_height(labels, [patch(98, 103, distance)], GRID, stand)
+    floating = height_check.tested_by_height(labels, [patch(98, 103, distance)], GRID, stand, None)
     assert (floating.classes[98:103, 205:255] == 0).all()
 
 
@@ -317,7 +318,40 @@ def test_small_and_unsupported_pieces_on_the_water_are_ghosts() -> None:
     labels.probability[:, 130:132, 203:260] = np.array([0.7, 0.2, 0.1], np.float32)[:, None, None]
     wall = patch(80, 86, RADIUS_M)
     assert (labels.classes[130:132, 200:203] == 1).all()
-    assert (height_check.tested_by_height(labels, [wall], GRID, stand).classes[130:132, 200:203] == 0).all()
+    assert (
+        height_check.tested_by_height(labels, [wall], GRID, stand, None).classes[130:132, 200:203] == 0
+    ).all()
+
+
+def test_a_thing_is_looked_up_where_it_was_before() -> None:
+    """The vessel has moved 2 m ahead: what stands 6 m to port was seen some 20 degrees beside where it is now."""
+    number = np.zeros((GRID.rows, GRID.columns), np.int32)
+    number[98:120, 200:260] = 1
+    then_from_now = SE3(np.eye(3), np.array([2.0, 0.0, 0.0]))
+    ahead = GRID.directions()[119, 230]
+    place = ahead * HEIGHT_M / np.tan(-GRID.elevations()[119]) / np.hypot(*ahead[:2])
+    then = then_from_now * place
+    column, row = np.round(GRID.pixels(then / np.linalg.norm(then))).astype(int)
+    assert abs(column - 230) > 20
+    odds = np.full((GRID.rows, GRID.columns), -3.0)
+    odds[row - 40 : row + 10, column - 45 : column + 45] = 2.0
+    moved, stayed = EarlierLooks(odds, then_from_now), EarlierLooks(odds, SE3(np.eye(3), np.zeros(3)))
+    assert moved.mean_odds(number, 2, GRID, HEIGHT_M)[1] > 1.5
+    assert stayed.mean_odds(number, 2, GRID, HEIGHT_M)[1] < 1.0
+    unseen = EarlierLooks(np.full_like(odds, np.nan), then_from_now)
+    assert np.isnan(unseen.mean_odds(number, 2, GRID, HEIGHT_M)[1])
+
+
+def test_what_looked_more_like_water_before_is_a_ghost() -> None:
+    """Matches alone make a thing of it, against its looks."""
+    distance = 5.0
+    foot = round(float((GRID.top_deg + np.rad2deg(np.arctan(HEIGHT_M / distance))) / GRID.step_deg))
+    labels, thing = labels_with(0, 104, foot), [patch(104, foot, distance)]
+    for then, kept in ((-1.2, True), (-2.5, False)):
+        odds = np.full((GRID.rows, GRID.columns), then)
+        before = EarlierLooks(odds, SE3(np.eye(3), np.zeros(3)))
+        found = height_check.tested_by_height(labels, thing, GRID, attitude(), before)
+        assert (found.classes[108:114, 210:250] == 1).mean() == kept
 
 
 def test_without_a_height_there_are_no_stixels() -> None:

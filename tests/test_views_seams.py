@@ -194,13 +194,15 @@ def test_horizon_levels_an_unknown_attitude() -> None:
 def test_the_height_on_which_ripples_agree() -> None:
     rng = np.random.default_rng(4)
     surface, mirrored = 2.1 + rng.normal(0, 0.1, 5000), rng.uniform(0.4, 12.0, 5000)
-    height, points = height_of_ripples(np.concatenate([surface, mirrored]))
+    height, points = height_of_ripples([surface, mirrored])
     assert height == pytest.approx(2.1, rel=0.02)
     assert 3500 < points < 6500
+    heaving = [2.1 * rise + rng.normal(0, 0.04, count) for rise, count in ((0.96, 5000), (1.04, 2500))]
+    assert height_of_ripples(heaving)[0] == pytest.approx(2.1, rel=0.01)
     with pytest.raises(EstimationError, match="one height"):
-        height_of_ripples(np.concatenate([surface, 1.6 * surface[:4000]]))
+        height_of_ripples([surface, 1.6 * surface[:4000]])
     with pytest.raises(EstimationError, match="too little"):
-        height_of_ripples(surface[:800])
+        height_of_ripples([surface[:800]])
 
 
 class Level:

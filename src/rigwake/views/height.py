@@ -74,7 +74,7 @@ def estimate_height(
     tilt = seen[0][1].tilt_std
     try:
         heights = [ripple_heights(images, rig, attitude, masks) for images, attitude in seen]
-        height, points = height_of_ripples(np.concatenate(heights))
+        height, points = height_of_ripples(heights)
     except EstimationError as error:
         why_not = error.cause
     else:

@@ -6,7 +6,7 @@ surface makes many points agree on one height, at all ranges and in all directio
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -27,6 +27,8 @@ _HEIGHTS_M = (0.3, 60.0)
 _STEP = 0.01  # of the histogram of logarithms
 _KERNEL = 4.0  # steps, standard deviation
 _NARROW = 2.0
+_HEAVE = 0.2  # relative, of the peak of one frame set about that of all
+_LEAST_OF_SET = 300
 _APART = 10  # steps between two peaks
 _LEAST_POINTS = 1500  # within the peak
 _SECOND = 0.5  # density of another peak, in densities of the first, beyond which neither is believed
@@ -47,11 +49,13 @@ def ripple_heights(
     return np.concatenate(found)
 
 
-def height_of_ripples(heights_m: Array) -> tuple[float, int]:
-    """The height on which by far the most of (N,) agree, metres, and how many do.
+def height_of_ripples(by_set: Sequence[Array]) -> tuple[float, int]:
+    """The height on which by far the most of all agree, metres, and how many do. by_set: (N,) heights of every frame
+    set; the vessel heaves, so that each has a peak of its own, and their mean counts.
 
     Raises EstimationError if there are too few or none stands out.
     """
+    heights_m = np.concatenate(by_set)
     low, high = np.log(_HEIGHTS_M)
     logarithm = np.log(heights_m[(heights_m > _HEIGHTS_M[0]) & (heights_m < _HEIGHTS_M[1])])
     edges = np.arange(low, high + _STEP, _STEP)
@@ -66,8 +70,17 @@ def height_of_ripples(heights_m: Array) -> tuple[float, int]:
     others = others[np.abs(others - best) > _APART]
     if len(others) and density[others].max() > _SECOND * density[best]:
         raise EstimationError("What two cameras match near the vessel does not agree on one height.")
-    # the wide kernel finds the right peak, but mirrored light under the surface draws it down; the narrow one less
-    near = logarithm[np.abs(logarithm - centre) < _APART * _STEP]
-    edges = np.arange(centre - _APART * _STEP, centre + _APART * _STEP, _STEP / 2)
+    own = [peak for heights in by_set if (peak := _peak_near(heights, centre)) is not None]
+    return float(np.exp(np.mean(own) if own else centre)), agreeing
+
+
+def _peak_near(heights_m: Array, centre: float) -> float | None:
+    """The peak of the logarithms within the heave about `centre`; None with too few. A narrow kernel: mirrored light
+    under the surface draws a wide one down."""
+    near = np.log(heights_m[heights_m > 0]) - centre
+    near = near[np.abs(near) < _HEAVE]
+    if len(near) < _LEAST_OF_SET:
+        return None
+    edges = np.arange(-_HEAVE, _HEAVE, _STEP / 2)
     density = cv2.GaussianBlur(np.histogram(near, edges)[0].astype(np.float64)[None], (0, 0), 2 * _NARROW)[0]
-    return float(np.exp(edges[int(density.argmax())] + _STEP / 4)), agreeing
+    return centre + float(edges[int(density.argmax())]) + _STEP / 4

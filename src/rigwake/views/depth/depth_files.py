@@ -20,6 +20,7 @@ from rigwake.views.depth.depth_panorama import (
     matched_points,
 )
 from rigwake.views.depth.height_check import tested_by_height
+from rigwake.views.depth.persistence import earlier_looks
 from rigwake.views.frames import frame_sets
 from rigwake.views.prepare import SurroundOptions, prepare_surround
 from rigwake.views.scene.network import shipped_network
@@ -90,10 +91,12 @@ def depth_to_folder(
         images, attitude = frames.images(setup.rig), setup.attitude_at(frames)
         surface = WaterAndShell(setup.shell_m) if setup.height else setup.surface_at(frames, attitude)
         strip = level_strip(images, setup.rig, attitude, surface, grid, setup.masks, frames.timestamp_ns)
-        points = matched_points(
-            images, setup.rig, attitude, setup.masks, nearest_m, setup.earlier(frames), sweeps
-        )
-        labels = tested_by_height(segment_strip(strip, network), points, grid, attitude)
+        earlier = setup.earlier(frames)
+        points = matched_points(images, setup.rig, attitude, setup.masks, nearest_m, earlier, sweeps)
+        before = None
+        if earlier is not None:
+            before = earlier_looks(earlier, setup.rig, attitude, surface, grid, network, setup.masks)
+        labels = tested_by_height(segment_strip(strip, network), points, grid, attitude, before)
         depth = fuse_depth(points, labels, grid, attitude, frames.timestamp_ns)
         matched += int((depth.source == MATCHED).sum())
         obstacles += int((labels.classes == OBSTACLE).sum())

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rigwake._types import Array, Floats
 from rigwake.views.attitude import LevelAttitude
 from rigwake.views.depth.epipolar import MatchedPoints
+from rigwake.views.depth.persistence import EarlierLooks
 from rigwake.views.scene.segmentation import NOT_SEEN, OBSTACLE, WATER, Labels
 from rigwake.views.strips import StripGrid
 
@@ -33,6 +34,7 @@ _STANDS = 0.35  # balance from which a pixel stands on what is under it
 _LEAST_PX = 8  # of a thing on the water
 # nats by looks alone, mean over a thing: without support by height, with some, and with much
 _SURE, _LIKELY, _POSSIBLE = 1.0, 0.3, -1.6
+_FADED = 0.7  # nats by which a thing looked less like one at its place before
 _SOME = 0.4  # points per pixel over the plane
 _SUPPORTED, _SUPPORTED_PX = 0.25, 4  # share of a thing's pixels that stand, and their least number
 _STRONG = 1.5  # points per pixel over the plane
@@ -127,10 +129,14 @@ def _around(count: Floats) -> Floats:
 
 
 def tested_by_height(
-    labels: Labels, matched: Sequence[MatchedPoints], grid: StripGrid, attitude: LevelAttitude
+    labels: Labels,
+    matched: Sequence[MatchedPoints],
+    grid: StripGrid,
+    attitude: LevelAttitude,
+    before: EarlierLooks | None,
 ) -> Labels:
-    """Labels of a level strip, corrected by where matched points lie; unchanged where the height above the water is
-    unknown."""
+    """Labels of a level strip, corrected by where matched points lie and by what was seen there before; unchanged
+    where the height above the water is unknown."""
     if not (np.isfinite(attitude.height_m) and attitude.height_m > 0) or not matched:
         return labels
     evidence = plane_evidence(matched, grid, attitude)
@@ -140,7 +146,7 @@ def tested_by_height(
     change -= np.where(standing, 0, _PLANE_NATS * evidence.in_plane(grid, attitude.height_m))
     logarithm = np.log(np.maximum(labels.probability, 1e-4))
     logarithm[OBSTACLE] += change
-    return without_ghosts(_relabelled(labels, logarithm), labels, evidence, grid)
+    return without_ghosts(_relabelled(labels, logarithm), labels, evidence, grid, before, attitude.height_m)
 
 
 def _relabelled(labels: Labels, logarithm: Floats) -> Labels:
@@ -150,11 +156,18 @@ def _relabelled(labels: Labels, logarithm: Floats) -> Labels:
     return Labels(classes, probability, labels.words)
 
 
-def without_ghosts(labels: Labels, looks: Labels, evidence: PlaneEvidence, grid: StripGrid) -> Labels:
-    """Labels without pieces of obstacle on open water that are too small or that too little speaks for; the others are
-    sure in all their pixels.
+def without_ghosts(
+    labels: Labels,
+    looks: Labels,
+    evidence: PlaneEvidence,
+    grid: StripGrid,
+    before: EarlierLooks | None = None,
+    height_m: float = np.nan,
+) -> Labels:
+    """Labels without pieces of obstacle on open water that are too small, that too little speaks for or that looked
+    more like water before; the others are sure in all their pixels.
 
-    looks: the labels before any test by height.
+    looks: the labels before any test by height. height_m: of the viewpoint above the water, for what was before.
     """
     obstacle = labels.classes == OBSTACLE
     number, count = numbered_around(obstacle)
@@ -183,6 +196,10 @@ def without_ghosts(labels: Labels, looks: Labels, evidence: PlaneEvidence, grid:
     partly = (over > _SOME * area) & (under < over)
     likely = (mean_odds > np.where(partly, _LIKELY, _SURE)) & ~unmatched | (mean_odds > _POSSIBLE) & supported
     likely &= area >= _LEAST_PX
+    if before is not None:
+        # a moving boat is not where it was: what clearly looks like an obstacle now stays one
+        then = before.mean_odds(number, count, grid, height_m)
+        likely &= ~((mean_odds < _SURE) & (then < np.maximum(_POSSIBLE, mean_odds - _FADED)))
     likely[0], afloat[0] = True, False
     nats = np.where(likely, np.where(supported, _BOTH_NATS, _LOOKS_NATS), -_LOOKS_NATS)
     chosen = afloat[number]

@@ -13,6 +13,7 @@ from rigwake.views.attitude import LevelAttitude
 from rigwake.views.depth.depth_panorama import fuse_depth, matched_points
 from rigwake.views.depth.height_check import tested_by_height
 from rigwake.views.depth.motion import Earlier
+from rigwake.views.depth.persistence import earlier_looks
 from rigwake.views.scene.network import shipped_network
 from rigwake.views.scene.segmentation import (
     OBSTACLE,
@@ -65,7 +66,12 @@ class StixelEstimator:
         inverse: tuple[Array | None, Array | None] = (None, None)
         if self.uses_matches and (len(images) > 1 or earlier is not None):
             matched = matched_points(images, self.rig, attitude, self.masks, earlier=earlier)
-            labels = tested_by_height(labels, matched, self.grid, attitude)
+            before = None
+            if earlier is not None:
+                before = earlier_looks(
+                    earlier, self.rig, attitude, surface, self.grid, self.classifier, self.masks
+                )
+            labels = tested_by_height(labels, matched, self.grid, attitude, before)
             labels = self._smoothed.next(strip, labels)
             inverse = fuse_depth(matched, labels, self.grid, attitude, timestamp_ns).inverse_horizontal()
         else:
