@@ -12,7 +12,7 @@ from rigwake.cameras.protocol import CameraModel
 
 _REACH_DEG, _STEP_DEG = 2.5, 0.05  # of the elevations searched, about the level
 _COLUMN_DEG = 1.0
-_LOWEST_CAMERA_DEG = 12.0  # half of what a camera must see beside its axis for the line's slope to be told
+_LEAST_REACH_DEG = 24.0  # of azimuths, for the line's slope to be told
 _EDGE_DEG, _EDGE_PX = 0.3, 1.5  # over which brightness above and below is compared: the larger
 _LEAST_LIGHT = 25.0  # grey levels of the mean: less is night
 _LEAST_CONTRAST = 6.0  # grey levels across the line
@@ -43,8 +43,7 @@ class HorizonSearch:
         self._agree = np.deg2rad(max(_AGREE_DEG, _AGREE_PX * pixel_deg))
         reach = _REACH_DEG + self._edge_deg
         self._elevations = np.deg2rad(np.arange(-reach, reach + _STEP_DEG / 2, _STEP_DEG))
-        half = np.arange(-89.0, 89.1, _COLUMN_DEG)
-        self._azimuths = np.deg2rad(half)
+        self._azimuths = np.deg2rad(np.arange(-89.0, 89.1, _COLUMN_DEG))
 
     def find(self, picture: Image, up_rig: Array) -> HorizonLine | None:
         """The line in a picture (H, W) of grey levels, None where no straight edge goes across it.
@@ -121,7 +120,7 @@ def _edges(strip: Array, seen: Mask, elevations: Array, edge_deg: float) -> tupl
 def fit_line(azimuth: Array, elevation: Array, limit: float) -> HorizonLine | None:
     """The line through most of the columns (N,) radians; None where too few agree to `limit`, or all lie close
     together."""
-    if len(azimuth) < 2 * _LOWEST_CAMERA_DEG / _COLUMN_DEG:
+    if len(azimuth) < _LEAST_REACH_DEG / _COLUMN_DEG:
         return None
     A = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
     line = np.array([float(np.median(elevation)), 0.0])
@@ -132,7 +131,7 @@ def fit_line(azimuth: Array, elevation: Array, limit: float) -> HorizonLine | No
     residual = elevation - A @ line
     agree = np.abs(residual) <= limit
     reach = azimuth[agree]
-    if agree.mean() < _LEAST_AGREEING or np.ptp(reach) < np.deg2rad(2 * _LOWEST_CAMERA_DEG):
+    if agree.mean() < _LEAST_AGREEING or np.ptp(reach) < np.deg2rad(_LEAST_REACH_DEG):
         return None
     noise = float(residual[agree].std()) + 1e-5
     covariance = noise**2 * np.linalg.inv(A[agree].T @ A[agree])
