@@ -76,7 +76,7 @@ def block_motion(pairs: EpipolarPairs, rig: Rig, motion: RigMotion, bias: GyroBi
         return None
     for _ in range(2):
         scale = _noise(way_residuals(pairs, between.rotation, way), pairs)
-        velocity, way = solve_velocities(pairs, between, priors, place, scale[pairs.camera], velocity, 3)
+        velocity, way = solve_velocities(pairs, between, priors, place, scale[pairs.camera], velocity, 2)
     return BlockMotion(pairs, place, between, priors, velocity, way, scale, bias)
 
 

@@ -23,7 +23,7 @@ from rigwake._robust import MAD_TO_STD
 from rigwake._types import Array, Indices, Mask
 from rigwake.geometry import so3
 from rigwake.monitor.block_motion import BlockMotion
-from rigwake.monitor.pair_kernels import MOUNTING, sum_by
+from rigwake.monitor.pair_kernels import MOUNTING, cross, sum_by, times
 from rigwake.monitor.rig_motion import PairMotion, RigMotion
 from rigwake.monitor.score import BlockScores
 from rigwake.rig import Rig
@@ -129,23 +129,23 @@ def _residuals(seen: _LinkedViews, mounts: _Mounts) -> tuple[Array, Array]:
     """Angles (M, 2) across and within the epipolar plane, and their standard deviations, radians."""
     velocity = seen.velocity
     views = seen.views
-    u = _times(mounts.source_turn, views.first)
+    u = times(mounts.source_turn, views.first)
     rotation, by_velocity, known = seen.later.rotation, seen.later.by_velocity, seen.later.known
-    after = _times(rotation, _times(mounts.source_turn, views.later))
-    way = _times(by_velocity, velocity) + known
-    way += _times(rotation, mounts.source_place) - mounts.source_place
+    after = times(rotation, times(mounts.source_turn, views.later))
+    way = times(by_velocity, velocity) + known
+    way += times(rotation, mounts.source_place) - mounts.source_place
     inverse_range, range_std = inverse_ranges(u, after, way, views.std, seen.moving)
     rotation, by_velocity, known = seen.other.rotation, seen.other.by_velocity, seen.other.known
-    place = _times(rotation, mounts.target_place) + known
-    place += _times(by_velocity, velocity)
-    there = _times(rotation, _times(mounts.target_turn, views.seen))
+    place = times(rotation, mounts.target_place) + known
+    place += times(by_velocity, velocity)
+    there = times(rotation, times(mounts.target_turn, views.seen))
     base = mounts.source_place - place
-    normal = np.cross(base, u)
+    normal = cross(base, u)
     across = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = normal / np.maximum(across, 1e-9)
     towards = u + inverse_range[:, None] * base
     length = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-6)
-    inplane = np.cross(normal, towards / length)
+    inplane = cross(normal, towards / length)
     residual = np.stack([(normal * there).sum(axis=1), (inplane * there).sum(axis=1)], axis=1)
     ahead = (towards * there).sum(axis=1)
     residual[ahead < 0] = np.pi
@@ -160,20 +160,15 @@ def inverse_ranges(u: Array, after: Array, way: Array, std: Array, moving: Mask)
     u, after: (M, 3) bearings of the first and the later sighting, way: (M, 3) between them, all in rig axes at the
     first. std: (M, 2) or more, radians. moving: (M,) whether the way is known.
     """
-    normal = np.cross(u, after)
+    normal = cross(u, after)
     side = np.linalg.norm(way - (way * u).sum(axis=1, keepdims=True) * u, axis=1)
-    forward = (np.cross(way, after) * normal).sum(axis=1)
+    forward = (cross(way, after) * normal).sum(axis=1)
     known = moving & (side > _LEAST_WAY_M) & (np.abs(forward) > 1e-12)
     measured = (normal**2).sum(axis=1) / np.where(known, forward, 1.0)
     measured_std = np.where(known, np.hypot(std[:, 0], std[:, 1]) / np.maximum(side, 1e-6), 1e3)
     weight, usual = measured_std**-2.0, _INVERSE_RANGE_STD**-2.0
     total = weight + usual
     return (measured * weight + _INVERSE_RANGE * usual) / total, total**-0.5
-
-
-def _times(matrices: Array, vectors: Array) -> Array:
-    """(M, 3) products."""
-    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
 
 
 def _jacobian(seen: _LinkedViews, mounts: _Mounts) -> Array:
@@ -199,7 +194,7 @@ def _later(seen: _LinkedViews, seconds: float) -> _LinkedViews:
     """As if the other camera had seen it later, the rig going on as it goes over the track's second."""
     other, span = seen.other, ((seen.views.later_ns - seen.views.first_ns) * 1e-9)[:, None]
     turned = so3.exp(so3.log(seen.later.rotation) / span * seconds)
-    more = _times(seen.later.by_velocity, seen.velocity) / span * seconds
+    more = times(seen.later.by_velocity, seen.velocity) / span * seconds
     return replace(seen, other=replace(other, rotation=other.rotation @ turned, known=other.known + more))
 
 

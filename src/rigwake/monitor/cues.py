@@ -28,6 +28,7 @@ from rigwake.tracks import CrossViews
 CUES = ("ego-motion", "overlap", "landmarks")
 HORIZON = "horizon"  # from pictures alone, beside those
 _SUSPECT_BLOCKS = 3
+_LARGEST_TURN_DEG = 3.0
 _LIVELY_RATE = np.deg2rad(15.0)  # rad/s
 
 
@@ -162,5 +163,8 @@ def _words(name: str, scores: BlockScores, statistics: BlockStatistics, threshol
     largest = f"largest {statistics.value[block, camera]:.0f} of {thresholds.alarm:g} ({scores.cameras[camera]}, {at})"
     seen = np.sort(statistics.std_deg[-1], axis=None)
     seen = seen[np.isfinite(seen)]
-    to = f"; sees turns of {5 * seen[0]:.2f} deg and more" if len(seen) else ""
+    sees = (
+        len(seen) > 0 and 5 * seen[0] < _LARGEST_TURN_DEG
+    )  # before a cue knows its offsets, it sees nothing
+    to = f"; sees turns of {5 * seen[0]:.2f} deg and more" if sees else ""
     return f"{name}: {largest}{to}"

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from rigwake._tables import take_rows
 from rigwake._types import Array, Indices, Mask
+from rigwake.geometry.interpolate import nearest_indices
 from rigwake.monitor.horizon_line import HorizonSearch, level_axes
 from rigwake.monitor.innovations import horizon_columns
 from rigwake.monitor.pair_kernels import MOUNTING
@@ -85,7 +86,7 @@ def look_at_horizon(
             continue
         search = HorizonSearch(stream.model, camera.rig_from_cam.rotation, (hulls or {}).get(name))
         on_rig = stream.timestamps_ns + round(camera.time_offset_s * 1e9)
-        nearest = _nearest(on_rig, middles)
+        nearest = nearest_indices(on_rig, middles)
         near = np.abs(on_rig[nearest] - middles) < _SLOT_S / 2 * 1e9
         slot_of = dict(zip(nearest[near].tolist(), np.flatnonzero(near).tolist(), strict=True))
         frames = np.array(sorted(slot_of), dtype=np.int64)
@@ -103,13 +104,6 @@ def look_at_horizon(
         )
     columns = [np.array(column) for column in zip(*found, strict=True)]
     return HorizonSightings(*columns)
-
-
-def _nearest(stamps: Indices, wanted: Indices) -> Indices:
-    """Rows of increasing stamps that lie nearest."""
-    after = np.clip(np.searchsorted(stamps, wanted), min(1, len(stamps) - 1), len(stamps) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(wanted - stamps[before] <= stamps[after] - wanted, before, after)
 
 
 def score_horizon(sightings: HorizonSightings, blocks: BlockScores) -> BlockScores:

@@ -12,11 +12,11 @@ from rigwake.cameras.protocol import CameraModel
 
 _REACH_DEG, _STEP_DEG = 2.5, 0.05  # of the elevations searched, about the level
 _COLUMN_DEG = 1.0
-_LOWEST_CAMERA_DEG = 12.0  # half of what a camera must see beside its axis for the line's slope to be told
-_EDGE_DEG = 0.3  # over which brightness above and below is compared
+_LEAST_REACH_DEG = 24.0  # of azimuths, for the line's slope to be told
+_EDGE_DEG, _EDGE_PX = 0.3, 1.5  # over which brightness above and below is compared: the larger
 _LEAST_LIGHT = 25.0  # grey levels of the mean: less is night
 _LEAST_CONTRAST = 6.0  # grey levels across the line
-_AGREE_DEG = 0.12  # so far may a column's edge lie from the line: a shore is not straight
+_AGREE_DEG, _AGREE_PX = 0.12, 0.4  # so far may a column's edge lie from the line: a shore is not straight
 _LEAST_AGREEING = 0.7  # part of the columns
 _ROUNDS = 6
 
@@ -38,9 +38,12 @@ class HorizonSearch:
 
     def __init__(self, model: CameraModel, rig_from_cam_rotation: Array, masked: Mask | None = None) -> None:
         self._model, self._mounted, self._masked = model, rig_from_cam_rotation, masked
-        self._elevations = np.deg2rad(np.arange(-_REACH_DEG, _REACH_DEG + _STEP_DEG / 2, _STEP_DEG))
-        half = np.arange(-89.0, 89.1, _COLUMN_DEG)
-        self._azimuths = np.deg2rad(half)
+        pixel_deg = _pixel_deg(model)
+        self._edge_deg = max(_EDGE_DEG, _EDGE_PX * pixel_deg)
+        self._agree = np.deg2rad(max(_AGREE_DEG, _AGREE_PX * pixel_deg))
+        reach = _REACH_DEG + self._edge_deg
+        self._elevations = np.deg2rad(np.arange(-reach, reach + _STEP_DEG / 2, _STEP_DEG))
+        self._azimuths = np.deg2rad(np.arange(-89.0, 89.1, _COLUMN_DEG))
 
     def find(self, picture: Image, up_rig: Array) -> HorizonLine | None:
         """The line in a picture (H, W) of grey levels, None where no straight edge goes across it.
@@ -50,8 +53,8 @@ class HorizonSearch:
         if float(picture.mean()) < _LEAST_LIGHT:
             return None
         strip, seen = self._strip(picture, up_rig)
-        columns, elevation = _edges(strip, seen, self._elevations)
-        return fit_line(self._azimuths[columns], elevation)
+        columns, elevation = _edges(strip, seen, self._elevations, self._edge_deg)
+        return fit_line(self._azimuths[columns], elevation, self._agree)
 
     def _strip(self, picture: Image, up_rig: Array) -> tuple[Array, Mask]:
         """Grey levels by elevation (rows, upwards) and azimuth, and which columns are seen whole."""
@@ -74,6 +77,12 @@ class HorizonSearch:
         return strip, inside.reshape(shape).all(axis=0)
 
 
+def _pixel_deg(model: CameraModel) -> float:
+    """How wide a pixel is on the optical axis."""
+    d_point = model.project_with_jacobians(np.array([[0.0, 0.0, 1.0]])).d_point[0]
+    return float(np.rad2deg(1 / np.sqrt(max(abs(np.linalg.det(d_point[:, :2])), 1e-6))))
+
+
 def level_axes(rig_from_cam_rotation: Array, up_rig: Array) -> tuple[Array, Array]:
     """Level unit vectors (3,) ahead of a camera and at its left, in rig axes."""
     axis = rig_from_cam_rotation[:, 2]
@@ -82,10 +91,10 @@ def level_axes(rig_from_cam_rotation: Array, up_rig: Array) -> tuple[Array, Arra
     return ahead, np.cross(up_rig, ahead)
 
 
-def _edges(strip: Array, seen: Mask, elevations: Array) -> tuple[Mask, Array]:
+def _edges(strip: Array, seen: Mask, elevations: Array, edge_deg: float) -> tuple[Mask, Array]:
     """Which columns have an edge, bright above and dark below or the other way round as most have it, and at which
     elevation (radians), to a fraction of a row."""
-    half = max(round(_EDGE_DEG / _STEP_DEG), 1)
+    half = max(round(edge_deg / _STEP_DEG), 1)
     sums = np.concatenate([np.zeros((1, strip.shape[1])), np.cumsum(strip, axis=0)])
     middle = np.arange(half, len(strip) - half)
     above = (sums[middle + half + 1] - sums[middle + 1]) / half
@@ -108,13 +117,13 @@ def _edges(strip: Array, seen: Mask, elevations: Array) -> tuple[Mask, Array]:
     return used, elevation[used]
 
 
-def fit_line(azimuth: Array, elevation: Array) -> HorizonLine | None:
-    """The line through most of the columns (N,) radians; None where too few agree, or they are all on one side."""
-    if len(azimuth) < 2 * _LOWEST_CAMERA_DEG / _COLUMN_DEG:
+def fit_line(azimuth: Array, elevation: Array, limit: float) -> HorizonLine | None:
+    """The line through most of the columns (N,) radians; None where too few agree to `limit`, or all lie close
+    together."""
+    if len(azimuth) < _LEAST_REACH_DEG / _COLUMN_DEG:
         return None
     A = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
     line = np.array([float(np.median(elevation)), 0.0])
-    limit = np.deg2rad(_AGREE_DEG)
     for _ in range(_ROUNDS):
         scale = max(limit / 2, 1.5 * float(np.median(np.abs(elevation - A @ line))))
         weight = 1 / (1 + ((elevation - A @ line) / scale) ** 2) ** 2
@@ -122,7 +131,7 @@ def fit_line(azimuth: Array, elevation: Array) -> HorizonLine | None:
     residual = elevation - A @ line
     agree = np.abs(residual) <= limit
     reach = azimuth[agree]
-    if agree.mean() < _LEAST_AGREEING or np.ptp(reach) < np.deg2rad(2 * _LOWEST_CAMERA_DEG):
+    if agree.mean() < _LEAST_AGREEING or np.ptp(reach) < np.deg2rad(_LEAST_REACH_DEG):
         return None
     noise = float(residual[agree].std()) + 1e-5
     covariance = noise**2 * np.linalg.inv(A[agree].T @ A[agree])

@@ -205,3 +205,35 @@ def sum_by(index: Indices, values: Array, weight: Array, out: Array) -> None:
     for i in range(len(index)):
         for j in range(values.shape[1]):
             out[index[i], j] += weight[i] * values[i, j]
+
+
+@njit(**_options)
+def times(matrices: Array, vectors: Array) -> Array:
+    """(M, 3) products of matrices (M, 3, 3) and vectors (M, 3)."""
+    out = np.empty((len(vectors), 3))
+    for i in range(len(vectors)):
+        for j in range(3):
+            out[i, j] = (
+                matrices[i, j, 0] * vectors[i, 0]
+                + matrices[i, j, 1] * vectors[i, 1]
+                + matrices[i, j, 2] * vectors[i, 2]
+            )
+    return out
+
+
+@njit(**_options)
+def cross(first: Array, second: Array) -> Array:
+    """(M, 3) cross products."""
+    out = np.empty((len(first), 3))
+    for i in range(len(first)):
+        _cross(first[i], second[i], out[i])
+    return out
+
+
+@njit(**_options)
+def sum_products(sector: Indices, values: Array, weight: Array, out: Array) -> None:
+    """Add the products of `values` (N, K) with themselves, weighted, to `out` (S, K, K) by sector (N,)."""
+    for i in range(len(sector)):
+        for j in range(values.shape[1]):
+            for q in range(values.shape[1]):
+                out[sector[i], j, q] += weight[i] * values[i, j] * values[i, q]

@@ -27,7 +27,7 @@ from rigwake.monitor.block_motion import (
     way_residuals,
 )
 from rigwake.monitor.frame_pairs import EpipolarPairs, pair_frames
-from rigwake.monitor.pair_kernels import COLUMNS, LOSS_STDS, MOUNTING, accumulate, sum_by
+from rigwake.monitor.pair_kernels import COLUMNS, LOSS_STDS, MOUNTING, accumulate, sum_by, sum_products
 from rigwake.monitor.rig_motion import PairMotion, RigMotion
 from rigwake.monitor.velocity import Slots, VelocityPriors
 from rigwake.rig import Rig
@@ -366,10 +366,7 @@ def _sectors(rows: Array, weight: Array, pairs: EpipolarPairs) -> Array:
         middle = np.median(pairs.pixels[mine], axis=0)
         right, low = (pairs.pixels[mine] > middle).T
         sector = 2 * low.astype(np.int64) + right
-        values = picked[mine]
-        sums = np.zeros((_SECTORS, 16))
-        sum_by(sector, (values[:, :, None] * values[:, None, :]).reshape(-1, 16), weight[mine], sums)
-        result[k] = sums.reshape(_SECTORS, 4, 4)
+        sum_products(sector, picked[mine], weight[mine], result[k])
     return result
 
 

@@ -15,6 +15,7 @@ from rigwake.monitor.rig_motion import PairMotion, RigMotion, VelocityGained, di
 
 _GUESS_STD = 0.5  # m/s
 _TRIALS, _TRIAL_ROWS = 20, 2000  # first guesses, and observations that each is tried on
+_THINNED, _LAST_ROUNDS = 4, 2  # of observations until the last rounds
 _ACCEL_MARGIN = 2.0  # over the data sheet's noise: vibration, interpolation
 _VELOCITY_FLOOR = 1e-3  # m/s, between neighbouring slots
 _LEVEL_STD, _ACCEL_BIAS_STD = 0.5, 0.1  # m/s^2
@@ -86,17 +87,20 @@ class VelocityPriors:
         across = so3.hat((velocity[1:] + velocity[:-1]) / 2) @ gained.by_accel_bias + gained.by_gyro_bias
         error = np.diff(velocity, axis=0) - gained.change + across @ self.gyro_bias
         std = np.sqrt((_ACCEL_MARGIN * self.accel_noise) ** 2 * steps + _VELOCITY_FLOOR**2)[:, None]
-        J = np.zeros((count - 1, 3, size))
-        link = np.arange(count - 1)
-        for axis in range(3):
-            J[link, axis, 3 * link + axis] = -1.0
-            J[link, axis, 3 * link + 3 + axis] = 1.0
-            J[link, axis, 3 * count + axis] = -steps
-        J[:, :, 3 * count + 3 : 3 * count + 6] = -gained.by_accel_bias
-        J[:, :, 3 * count + 6 :] = across
-        rows = (J / std[:, :, None]).reshape(-1, size)
-        H += rows.T @ rows
-        g -= rows.T @ (error / std).ravel()
+        one = np.broadcast_to(np.eye(3), across.shape)
+        J = np.concatenate([-one, one, -steps[:, None, None] * one, -gained.by_accel_bias, across], axis=2)
+        J /= std[:, :, None]
+        products = np.swapaxes(J, 1, 2) @ J
+        pulls = (np.swapaxes(J, 1, 2) @ (error / std)[:, :, None])[:, :, 0]
+        two, rest = 3 * np.arange(count - 1)[:, None] + np.arange(6), slice(3 * count, size)
+        for links in (slice(0, None, 2), slice(1, None, 2)):  # those of one go share no slot
+            at = two[links]
+            H[at[:, :, None], at[:, None, :]] += products[links, :6, :6]
+            H[at, rest] += products[links, :6, 6:]
+            g[at] -= pulls[links, :6]
+        H[rest, : 3 * count] = H[: 3 * count, rest].T
+        H[rest, rest] += products[:, 6:, 6:].sum(axis=0)
+        g[rest] -= pulls[:, 6:].sum(axis=0)
         at = np.arange(3 * count, 3 * count + 3)
         H[at, at] += _LEVEL_STD**-2.0
         H[at + 3, at + 3] += _ACCEL_BIAS_STD**-2.0
@@ -130,14 +134,14 @@ def solve_velocities(
     lever = np.einsum("nij,nj->ni", between.rotation, place) - place + between.known
     velocity = _first_guess(pairs, between, priors, lever) if start is None else start
     count = len(slots.reference_ns)
+    rows = (pairs.first, pairs.second, pairs.std, pairs.pair)
+    thinned = tuple(values[::_THINNED] for values in rows)
     for k in range(rounds):
+        thin = k < rounds - _LAST_ROUNDS
         way = np.einsum("nij,nj->ni", between.by_velocity, velocity[slots.slot]) + lever
         H_slot, g_slot = np.zeros((count, 3, 3)), np.zeros((count, 3))
         accumulate_velocity(
-            pairs.first,
-            pairs.second,
-            pairs.std,
-            pairs.pair,
+            *(thinned if thin else rows),
             between.rotation,
             way,
             between.by_velocity,
@@ -148,8 +152,9 @@ def solve_velocities(
         )
         H, g = priors.normal_equations(velocity)
         H, g = H[:-3, :-3], g[:-3]  # the gyro's bias is known well enough here
-        _add_blocks(H, H_slot)
-        g[: 3 * count] -= g_slot.ravel()
+        share = _THINNED if thin else 1
+        _add_blocks(H, share * H_slot)
+        g[: 3 * count] -= share * g_slot.ravel()
         step = _solve_chain(H, g, 3 * count)[: 3 * count].reshape(count, 3)
         longest = 0.5 * max(float(np.linalg.norm(velocity, axis=1).mean()), 0.2)
         velocity = velocity + step * min(1.0, longest / max(float(np.linalg.norm(step, axis=1).max()), 1e-12))
@@ -223,14 +228,15 @@ def _guess_per_slot(pairs: EpipolarPairs, slots: Slots, between: PairMotion, spa
 
     Lever arms are left out: they are short against a second's way.
     """
-    after = np.einsum("nij,nj->ni", between.rotation[pairs.pair], pairs.second)
-    normal = np.cross(after, pairs.first)
+    first, second, pair = (values[::_THINNED] for values in (pairs.first, pairs.second, pairs.pair))
+    after = np.einsum("nij,nj->ni", between.rotation[pair], second)
+    normal = np.cross(after, first)
     length = np.linalg.norm(normal, axis=1)
     # planes of points with little parallax are uncertain, those of wrong tracks have much: neither counts more
-    in_level = np.einsum("nij,ni->nj", between.by_velocity[pairs.pair], normal)
+    in_level = np.einsum("nij,ni->nj", between.by_velocity[pair], normal)
     size = np.maximum(np.linalg.norm(in_level, axis=1), 1e-12)
     unit = in_level / size[:, None]
-    slot = slots.slot[pairs.pair]
+    slot = slots.slot[pair]
     weight = length / (length + 0.02)
     count = len(slots.reference_ns)
     for _ in range(6):
@@ -239,8 +245,8 @@ def _guess_per_slot(pairs: EpipolarPairs, slots: Slots, between: PairMotion, spa
         direction = np.linalg.eigh(sums.reshape(-1, 3, 3))[1][:, :, 0]
         across = np.einsum("ni,ni->n", unit, direction[slot])
         weight = length / (length + 0.02) / (1 + (across / 0.1) ** 2)
-    ahead = np.einsum("nij,nj->ni", between.by_velocity[pairs.pair], direction[slot])
-    parallax = np.einsum("ni,ni->n", np.cross(ahead, after), np.cross(pairs.first, after))
+    ahead = np.einsum("nij,nj->ni", between.by_velocity[pair], direction[slot])
+    parallax = np.einsum("ni,ni->n", np.cross(ahead, after), np.cross(first, after))
     vote = np.zeros((count, 1))
     sum_by(slot, np.sign(parallax)[:, None], weight, vote)
     seconds = np.linalg.norm(spans.by_velocity[:, :, 0], axis=1)
