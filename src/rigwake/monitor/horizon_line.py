@@ -74,7 +74,7 @@ class HorizonSearch:
         shape = len(elevation), len(azimuth)
         maps = pixels.astype(np.float32).reshape(*shape, 2)
         strip = cv2.remap(picture, maps, None, cv2.INTER_LINEAR).astype(np.float64)
-        return strip, inside.reshape(shape).all(axis=0)
+        return strip, np.asarray(inside.reshape(shape).all(axis=0), dtype=bool)
 
 
 def _pixel_deg(model: CameraModel) -> float:
