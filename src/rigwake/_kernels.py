@@ -12,7 +12,7 @@ from uuid import uuid4
 import numba
 from numba.core.caching import IndexDataCacheFile
 
-__all__ = ["KernelFile", "inlined", "njit"]
+__all__ = ["KernelFile", "inlined", "is_stored", "njit"]
 
 
 class KernelFile(IndexDataCacheFile):
@@ -71,3 +71,12 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 inlined = njit(
     nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy", forceinline=True
 )
+
+
+def is_stored(kernel: Any) -> bool:
+    """Whether compiled code of a kernel, as it stands in the source now, is on disk."""
+    files = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+    try:
+        return isinstance(files, KernelFile) and bool(files._load_index())
+    except Exception:  # cut off or unreadable: what pickle raises then is anything
+        return False

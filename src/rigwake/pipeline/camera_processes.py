@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 
 from rigwake._progress import Progress
 from rigwake.pipeline.camera_stage import CameraJob, CameraOutcome, process_camera
+from rigwake.pipeline.kernel_warmup import compile_handeye, handeye_is_compiled
 from rigwake.workers import WorkerReport, run_in_processes
 
 Finished = Callable[[CameraOutcome], None]
 CameraRunner = Callable[[Sequence[CameraJob], int, Progress, Finished], list[CameraOutcome]]
 """What does the camera stage: `process_cameras`, or a cluster."""
 
+_COMPILING = "compiled loops (first use)"
 _SEND_EVERY = 0.01  # of a fraction
 
 
@@ -29,7 +32,11 @@ class _ProgressSender:
             self.report_stage(self.name, what, fraction)
 
 
-def _work(job: CameraJob, report_stage: WorkerReport) -> CameraOutcome:
+def _work(job: CameraJob | None, report_stage: WorkerReport) -> CameraOutcome | None:
+    """A camera, or None: the loops that the rig estimate needs are compiled."""
+    if job is None:
+        compile_handeye()
+        return None
     return process_camera(job, _ProgressSender(job.stream.name, report_stage))
 
 
@@ -43,6 +50,14 @@ def process_cameras(
 
     finished: called with every outcome as soon as it is there. Raises HostError when a process is ended from outside.
     """
-    by_name = {job.stream.name: job for job in jobs}
-    outcomes = run_in_processes(_work, by_name, processes, progress, lambda _, outcome: finished(outcome))
-    return list(outcomes.values())
+    by_name: dict[str, CameraJob | None] = {}
+    if min(processes or os.cpu_count() or 1, len(jobs)) > 1 and not handeye_is_compiled():
+        by_name[_COMPILING] = None  # first: meanwhile one camera compiles what all cameras need
+    by_name |= {job.stream.name: job for job in jobs}
+
+    def one_finished(_: str, outcome: CameraOutcome | None) -> None:
+        if outcome is not None:
+            finished(outcome)
+
+    outcomes = run_in_processes(_work, by_name, processes, progress, one_finished)
+    return [outcome for outcome in outcomes.values() if outcome is not None]
