@@ -72,6 +72,7 @@ def without_paths(text: str) -> str:
     for folder, word in ((ROOT, "."), (ROOT.parent, ".."), (Path.home(), "~")):
         if folder != Path("/"):
             text = text.replace(str(folder), word)
+    text = re.sub(r"(?<=-folder )/tmp/\S+", "FOLDER", text)
     text = re.sub(r"/tmp/[\w.-]+", "/tmp/...", text)
     # what else is absolute: its last part says enough
     return re.sub(r"(?<![\w./:~])/(?!tmp/)(?:[\w.-]+/)+(?=[\w.-])", ".../", text)

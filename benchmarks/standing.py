@@ -84,7 +84,7 @@ def estimate(rig: SurroundRig, shot: ViewShot, classifier: PixelClassifier, by_m
         before = earlier_looks(earlier, rig, attitude, surface, GRID, classifier, shot.hulls)
     labels = tested_by_height(alone, matched, GRID, attitude, before)
     depth = fuse_depth(matched, labels, GRID, attitude)
-    swept = matched_points(shot.images, rig, attitude, shot.hulls, sweeps=True)
+    swept = matched_points(shot.images, rig, attitude, shot.hulls, earlier=earlier, sweeps=True)
     true_labels = labels_drawn(rig, shot, strip)
     worlds = []
     exact = _sure(true_labels)
@@ -92,7 +92,7 @@ def estimate(rig: SurroundRig, shot: ViewShot, classifier: PixelClassifier, by_m
         fused = depth if found is labels else fuse_depth(matched, found, GRID, attitude)
         shift = contact_shifts(found, strip, shot.images, rig, attitude)
         worlds.append(find_stixels(found, GRID, attitude, *fused.inverse_horizontal(), shift))
-    by_sweep = fuse_depth(swept, labels, GRID, attitude)
+    by_sweep = fuse_depth(swept, tested_by_height(alone, swept, GRID, attitude, before), GRID, attitude)
     return Seen(shot, strip, alone, labels, depth, by_sweep, *worlds, true_labels)
 
 

@@ -182,6 +182,7 @@ USED = [
         (1, 2),
         "",
     ),
+    ("depth {calibration} {images} -o {here}/d4 --sweep --at 1 --height-m 2", 0, ""),
     ("depth {calibration} {images} --out {here}/d2 --count 0", 2, "at least one"),
     ("depth {calibration} {images} --output {here}/d3 --count 0", 2, "at least one"),
     # a wrong recording, or one too short: refused before any work

@@ -1,19 +1,30 @@
 """Hand-eye's loops are compiled beside the cameras' work, once."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from rigwake.pipeline import camera_processes
 from rigwake.pipeline.camera_processes import process_cameras
-from rigwake.pipeline.kernel_warmup import compile_handeye, handeye_is_compiled
 
 CAMERAS = [SimpleNamespace(stream=SimpleNamespace(name=name)) for name in ("left", "right")]
 
 
-def test_a_small_problem_leaves_compiled_loops_on_disk() -> None:
-    compile_handeye()
-    assert handeye_is_compiled()
+@pytest.mark.slow  # compiles for half a minute
+def test_a_small_problem_leaves_compiled_loops_on_disk(tmp_path: Path) -> None:
+    program = (
+        "from rigwake.pipeline.kernel_warmup import compile_handeye, handeye_is_compiled\n"
+        "before = handeye_is_compiled(); compile_handeye(); print(before, handeye_is_compiled())"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, env=environment
+    )
+    assert run.stdout.split() == ["False", "True"]
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def _noted(patch: pytest.MonkeyPatch, *, stop: type[Exception] | None = None) ->
     found, estimate = [], calibration_run.estimate_vetted_rig
 
     def note(opened: Recording, selection: Selection, *given: Any, **chosen: Any) -> Any:
-        found.append(given)
+        found.append((*given, selection, chosen))
         if stop is not None:
             raise stop
         return estimate(opened, selection, *given, **chosen)
@@ -253,7 +253,23 @@ class TestResume:
                 resume=True,
                 run_cameras=refuse,
             )
-        (tracks, trajectories, *_), (first_tracks, first_trajectories, *_) = inputs[0], sail.estimated_from
+        (
+            (tracks, trajectories, *_, selection, chosen),
+            (first_tracks, first_trajectories, *_, first, first_chosen),
+        ) = (
+            inputs[0],
+            sail.estimated_from,
+        )
+        told = ("external", "without_horizon", "guessed")
+        assert [chosen[name] for name in told] == [first_chosen[name] for name in told]
+        np.testing.assert_array_equal(selection.imu.gyro, first.imu.gyro)
+        np.testing.assert_array_equal(selection.imu.timestamps_ns, first.imu.timestamps_ns)
+        for name in OFFSETS_MS:
+            lens, first_lens = selection.cameras[name].model, first.cameras[name].model
+            np.testing.assert_array_equal(lens.params, first_lens.params)
+            np.testing.assert_array_equal(
+                selection.cameras[name].timestamps_ns, first.cameras[name].timestamps_ns
+            )
         assert set(tracks) == set(first_tracks) == set(OFFSETS_MS)
         for name in OFFSETS_MS:
             np.testing.assert_array_equal(tracks[name].frame_indices, first_tracks[name].frame_indices)

@@ -16,9 +16,10 @@ from rigwake.views.depth.depth_files import point_cloud
 from rigwake.views.depth.depth_panorama import MATCHED, PLANE, fuse_depth, matched_points
 from rigwake.views.depth.epipolar import MatchedPoints, _semi_global, epipolar_pairs
 from rigwake.views.depth.motion import Earlier, earlier_time, moved_points
-from rigwake.views.depth.persistence import EarlierLooks
+from rigwake.views.depth.persistence import EarlierLooks, earlier_looks
 from rigwake.views.depth.sgm import match_around
-from rigwake.views.depth.sweep import SWEEP_GRID, swept_points
+from rigwake.views.depth.sweep import SWEEP_GRID, _without_speckles, swept_points
+from rigwake.views.scene.colour_method import ColourClassifier
 from rigwake.views.scene.segmentation import Labels
 from rigwake.views.scene.stixel_cut import cut_columns
 from rigwake.views.scene.stixel_files import world_to_dict
@@ -135,6 +136,52 @@ def test_a_sweep_of_spheres_finds_the_ring_wherever_it_is_cut_open(seen) -> None
     both = np.isfinite(planes).all(axis=0)
     assert both.sum() > 0.97 * np.isfinite(planes[0]).sum()
     assert np.mean(np.abs(planes[0] / planes[1] - 1)[both] < 0.01) > 0.97
+
+
+def test_a_sweep_has_no_range_where_no_two_cameras_see(seen) -> None:  # type: ignore[no-untyped-def]
+    rig, stand, images, _ = seen
+    masks = {name: np.zeros(image.shape[:2], bool) for name, image in images.items()}
+    for mask in masks.values():
+        mask[mask.shape[0] // 2 :] = True
+    swept = swept_points(images, rig, stand, masks)
+    free = swept_points(images, rig, stand)
+    assert len(swept.points_level) > 0.2 * len(free.points_level)
+    for points in (swept.points_level, swept.tried_level):
+        views = np.zeros(len(points), int)
+        for name, model, cam in zip(
+            rig.names, rig.models, rig.cam_from_level(stand.level_from_rig), strict=True
+        ):
+            pixels, valid = model.project(cam * points)
+            column, row = np.round(np.nan_to_num(pixels, nan=-9.0)).astype(int).T
+            inside = valid & (column >= 0) & (row >= 0) & (column < model.width_px) & (row < model.height_px)
+            inside[inside] = ~masks[name][row[inside], column[inside]]
+            views += inside
+        assert np.mean(views < 2) < 0.02 + 0.98 * (points is swept.tried_level)
+    assert len(swept.tried_level) < 0.6 * len(free.tried_level)
+
+
+def test_a_small_thing_dead_astern_is_kept_like_any_other() -> None:
+    levels = np.full((20, 96), -16, np.int16)
+    for middle in (0, 48):
+        levels[5:10, np.arange(middle - 5, middle + 5) % 96] = 320
+    levels[15, 20:24] = 320  # too small
+    kept = _without_speckles(levels) > 0
+    assert kept.sum() == 100
+    np.testing.assert_array_equal(kept, np.roll(kept, 48, axis=1))
+
+
+def test_nothing_matched_is_no_range(seen) -> None:  # type: ignore[no-untyped-def]
+    rig, stand, images, _ = seen
+    dark = {name: np.zeros_like(image) for name, image in images.items()}
+    for matched in (matched_points(dark, rig, stand), matched_points(dark, rig, stand, sweeps=True)):
+        depth = fuse_depth(matched, ring_labels(), GRID, stand)
+        assert not (depth.source == MATCHED).any()
+
+
+def test_an_earlier_picture_from_below_the_water_says_nothing(seen) -> None:  # type: ignore[no-untyped-def]
+    rig, stand, images, _ = seen
+    sunk = Earlier(images, SE3(np.eye(3), np.array([0.0, 0.0, -5.0])))
+    assert earlier_looks(sunk, rig, stand, WaterAndShell(), GRID, ColourClassifier()) is None
 
 
 @pytest.mark.slow
@@ -311,7 +358,7 @@ def test_what_reaches_down_to_the_water_stands_and_what_floats_is_chance() -> No
     assert (floating.classes[98:103, 205:255] == 0).all()
 
 
-def test_small_and_unsupported_pieces_on_the_water_are_ghosts() -> None:
+def test_small_and_unsupported_pieces_on_the_water_are_spurious() -> None:
     stand = attitude()
     labels = labels_with(1, 130, 132)
     labels.classes[130:132, 203:260] = 0
@@ -342,7 +389,7 @@ def test_a_thing_is_looked_up_where_it_was_before() -> None:
     assert np.isnan(unseen.mean_odds(number, 2, GRID, HEIGHT_M)[1])
 
 
-def test_what_looked_more_like_water_before_is_a_ghost() -> None:
+def test_what_looked_more_like_water_before_is_spurious() -> None:
     """Matches alone make a thing of it, against its looks."""
     distance = 5.0
     foot = round(float((GRID.top_deg + np.rad2deg(np.arctan(HEIGHT_M / distance))) / GRID.step_deg))

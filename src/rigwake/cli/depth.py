@@ -29,7 +29,10 @@ def command(
     ] = None,
     nearest_m: Annotated[float, typer.Option(help="Nearest range that is looked for, metres.")] = 3.0,
     sweep: Annotated[
-        bool, typer.Option("--sweep", help="Match all cameras at once on spheres: coarser, one pass.")
+        bool,
+        typer.Option(
+            "--sweep", help="Match all cameras at once on spheres, instead of pair by pair: coarser."
+        ),
     ] = False,
     topic: TopicOption = None,
     topics: TopicsOption = None,

@@ -124,6 +124,7 @@ def _splatted(matched: Sequence[MatchedPoints], grid: StripGrid) -> tuple[Array,
     size = grid.rows * grid.columns
     inverse, std = np.full(size, np.nan), np.full(size, np.nan)
     texture, hits = np.zeros(size), np.zeros(size)
+    matched = [m for m in matched if len(m.texture)]  # at night nothing is matched
     if matched:
         points = np.concatenate([m.points_level for m in matched])
         deviation = np.concatenate([m.inverse_std for m in matched])

@@ -146,7 +146,9 @@ def tested_by_height(
     change -= np.where(standing, 0, _PLANE_NATS * evidence.in_plane(grid, attitude.height_m))
     logarithm = np.log(np.maximum(labels.probability, 1e-4))
     logarithm[OBSTACLE] += change
-    return without_ghosts(_relabelled(labels, logarithm), labels, evidence, grid, before, attitude.height_m)
+    return without_spurious_pieces(
+        _relabelled(labels, logarithm), labels, evidence, grid, before, attitude.height_m
+    )
 
 
 def _relabelled(labels: Labels, logarithm: Floats) -> Labels:
@@ -156,7 +158,7 @@ def _relabelled(labels: Labels, logarithm: Floats) -> Labels:
     return Labels(classes, probability, labels.words)
 
 
-def without_ghosts(
+def without_spurious_pieces(
     labels: Labels,
     looks: Labels,
     evidence: PlaneEvidence,

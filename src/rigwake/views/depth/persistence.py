@@ -62,14 +62,20 @@ def earlier_looks(
     grid: StripGrid,
     classifier: PixelClassifier,
     masks: Mapping[str, Mask] | None = None,
-) -> EarlierLooks:
-    """Segment the earlier pictures, levelled as the rig stood then. attitude: of now."""
+) -> EarlierLooks | None:
+    """Segment the earlier pictures, levelled as the rig stood then. attitude: of now.
+
+    None where the viewpoint's height above the water, now or then, is unknown or not positive (a small boat in waves).
+    """
     moved = earlier.rig_from_rig_then
     now = attitude.level_from_rig
     then = level_rotation(moved.rotation.T @ now[2], rig.forward_rig)
     way_level = now @ (moved * rig.viewpoint_rig - rig.viewpoint_rig)
     turn = then @ moved.rotation.T @ now.T
-    stand = replace(attitude, level_from_rig=then, height_m=attitude.height_m + float(way_level[2]))
+    height_m = attitude.height_m + float(way_level[2])
+    if not height_m > 0:
+        return None
+    stand = replace(attitude, level_from_rig=then, height_m=height_m)
     strip = level_strip(earlier.images, rig, stand, surface, grid, masks)
     labels = segment_strip(strip, classifier)
     logarithm = np.log(np.maximum(labels.probability, 1e-4))

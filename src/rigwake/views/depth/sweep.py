@@ -49,8 +49,12 @@ def swept_points(
     """Points that two cameras of a frame set see, found all around at once; None if no two see the same.
 
     images: by camera name. nearest_m: of the nearest sphere. The farthest is infinitely far; what is matched there has
-    no range.
+    no range. levels: how many spheres, a multiple of 8.
+
+    Raises ValueError for another number of levels.
     """
+    if levels % (_KNOT - 1):
+        raise ValueError(f"{levels} levels are not a multiple of {_KNOT - 1}.")
     there = [k for k, name in enumerate(rig.names) if name in images]
     if len(there) < 2:
         return None
@@ -66,9 +70,10 @@ def swept_points(
     _sweep(pictures, textures, pixels, first, second, cost, texture)
     level, ratio = match_around(cost)
     good = (texture > _LEAST_TEXTURE) & (ratio > _LEAST_RATIO) & (level > 0.5) & (level < levels - 1.01)
-    whole = np.where(good, np.round(16 * level), -16).astype(np.int16)
-    cv2.filterSpeckles(whole, -16, _SPECKLE_PX, 24)
-    good &= whole > 0
+    nearest = np.clip(np.round(level), 0, levels - 1).astype(np.int64)
+    # what is carried on from neighbours into a mask, or past the edge of a picture, nobody saw
+    good &= np.take_along_axis(cost, nearest[..., None], axis=2)[..., 0] != _UNKNOWN
+    good &= _without_speckles(np.where(good, np.round(16 * level), -16).astype(np.int16)) > 0
     inverse = level[good].astype(np.float64) * step
     directions = grid.directions()
     across = np.kron(baseline, np.ones((_COARSE, _COARSE)))[: grid.rows, : grid.columns]
@@ -76,8 +81,19 @@ def swept_points(
     std = np.maximum(_STD_LEVELS * step, 0.5 * np.deg2rad(grid.step_deg) / across[good])
     points = directions[good] / inverse[:, None]
     return MatchedPoints(
-        points, std, texture[good].astype(np.float64), NAMES, _tried(directions, texture, attitude)
+        points,
+        std,
+        texture[good].astype(np.float64),
+        NAMES,
+        _tried(directions[::2, ::2], texture[::2, ::2], attitude),
     )
+
+
+def _without_speckles(levels_16: NDArray[np.int16]) -> NDArray[np.int16]:
+    """Small pieces of 16ths of levels set to -16, also where the columns close into a ring."""
+    wrapped = np.pad(levels_16, ((0, 0), (_SPECKLE_PX, _SPECKLE_PX)), "wrap")
+    cv2.filterSpeckles(wrapped, -16, _SPECKLE_PX, 24)
+    return wrapped[:, _SPECKLE_PX:-_SPECKLE_PX]
 
 
 def _tried(directions: Array, texture: Floats, attitude: LevelAttitude) -> Array:
@@ -109,6 +125,7 @@ def _atlas(
         textures[at, :rows, :columns] = np.clip(deviation, 0, 255)
         if masks is not None and name in masks:
             pictures[at, :rows, :columns][masks[name]] = 0
+            textures[at, :rows, :columns][masks[name]] = 0
     return pictures, textures
 
 
@@ -212,8 +229,9 @@ def _profile(picture: Any, columns: int, rows: int, knots: Any, per: int, values
 @njit(nogil=True, fastmath=True)
 def _compare(one: Any, other: Any, cost: Any) -> None:
     for d in range(len(cost)):
-        apart = min(abs(one[d] - other[d]), np.float32(_MOST))
-        cost[d] = np.uint8(np.int32(apart if min(one[d], other[d]) >= 0 else np.float32(_UNKNOWN)))
+        apart = np.int32(min(abs(one[d] - other[d]), np.float32(_MOST)))
+        seen = min(one[d], other[d]) >= 0
+        cost[d] = np.uint8((apart - (apart == _UNKNOWN)) if seen else _UNKNOWN)  # that one says "not seen"
 
 
 @njit(nogil=True)
