@@ -177,12 +177,12 @@ USED = [
     ("stixels {calibration} {images} --out {here}/x2 --no-match --count 0", 2, "at least one"),
     ("stixels {calibration} {images} --output {here}/x3 --count 0", 2, "at least one"),
     (
-        "depth {calibration} {images} -o {here}/d1 --at 1 --count 1 --height-m 2 --nearest-m 3 --topic camera.front=/a "
+        "depth {calibration} {images} -o {here}/d1 --at 1 --count 1 --height-m 2 --nearest-m 3 --sweep "
+        "--topic camera.front=/a "
         "--topics {topics} --json {here}/d1.json",
         (1, 2),
         "",
     ),
-    ("depth {calibration} {images} -o {here}/d4 --sweep --at 1 --height-m 2", 0, ""),
     ("depth {calibration} {images} --out {here}/d2 --count 0", 2, "at least one"),
     ("depth {calibration} {images} --output {here}/d3 --count 0", 2, "at least one"),
     # a wrong recording, or one too short: refused before any work

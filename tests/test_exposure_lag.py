@@ -90,10 +90,14 @@ def test_frames_tracks_and_path_get_the_same_stamps():
     none = np.empty(0, dtype=np.int64)
     tracks = Tracks("cam", stamps[::2], none, none, np.empty((0, 2)), np.empty((0, 3)), np.empty(0))
     selection = Selection({"cam": stream, "dark": stream}, IMU, None)
-    after, by_camera, paths, (check,) = _restamped(selection, {"cam": tracks}, {"cam": camera})
+    after, by_camera, paths, (check,) = _restamped(selection, {"cam": tracks}, {"cam": camera}, repair=True)
     moved = after.cameras["cam"].timestamps_ns
     assert np.array_equal(by_camera["cam"].timestamps_ns, moved[::2])
     assert np.array_equal(paths["cam"].timestamps_ns, moved[:-1])
     assert after.cameras["dark"] is stream
     assert check.sensor == "camera cam"
     assert np.ptp(moved - stamps) == pytest.approx(0.9 * 27e6, rel=0.2)
+    kept, _, _, (told,) = _restamped(selection, {"cam": tracks}, {"cam": camera}, repair=False)
+    assert kept.cameras["cam"] is stream
+    assert told.action == "none"
+    assert "corrected" not in told.hypothesis

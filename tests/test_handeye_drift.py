@@ -73,3 +73,50 @@ def test_a_frozen_pose() -> None:
 
 def scaled(poses: SE3, factor: float) -> SE3:
     return SE3(poses.rotation, factor * poses.translation)
+
+
+def test_a_gap_of_the_reference_is_no_change() -> None:
+    times = np.arange(0, 200, 0.2)
+    rig, port = pair(times=times)
+    kept = np.flatnonzero((times < 60) | (times > 95))
+    assert check_steadiness(rig.take(kept), port, calibrate_handeye(rig, [port])) == ()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_slow_drift_of_an_odometry_is_no_change(seed: int) -> None:
+    """A scale that drifts by 3 %, and a heading of the reference that wanders by 0.4 deg over two minutes."""
+    times = np.arange(0, 300, 0.3)
+    rig, port = pair(planar, seed, times)
+    steps = port.world_from_body[:-1].inverse() * port.world_from_body[1:]
+    grown = SE3(steps.rotation, steps.translation * np.linspace(1.0, 1.03, len(steps))[:, None])
+    drifted = [port.world_from_body[0]]
+    for step in grown:
+        drifted.append(drifted[-1] * step)
+    rng, heading = np.random.default_rng(seed), [0.0]
+    for _ in times[1:]:
+        heading.append(heading[-1] * (1 - 0.3 / 120) + 0.4 * np.sqrt(0.6 / 120) * rng.normal())
+    turned = rig.world_from_body * SE3(
+        so3.exp(np.radians(np.outer(heading, [0, 0, 1]))), np.zeros((len(times), 3))
+    )
+    for one, other in (
+        (rig, replace(port, world_from_body=stacked(drifted))),
+        (replace(rig, world_from_body=turned), port),
+    ):
+        assert check_steadiness(one, other, calibrate_handeye(one, [other])) == ()
+
+
+def test_noise_at_a_mooring_is_no_scale() -> None:
+    times = np.arange(0, 240, 0.2)
+    roll = np.outer(0.14 * np.sin(times), [1, 0, 0]) + np.outer(0.1 * np.sin(0.7 * times), [0, 1, 0.4])
+    sway = 0.15 * np.stack([np.sin(0.3 * times), np.sin(0.23 * times), np.sin(0.9 * times)], axis=1)
+    moored = SE3(so3.exp(roll), sway)
+    rng = np.random.default_rng(0)
+    rig = trajectory("rig", moored, times)
+    port = trajectory("port", drifting(moored * PORT, 1e-3, 1e-2, rng), times)
+    _, checks, noticed = run_handeye(rig, [port], HandeyeOptions())
+    assert all(check.agrees for check in checks)
+    assert noticed == ()
+
+
+def stacked(poses: list[SE3]) -> SE3:
+    return SE3(np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses]))

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from rigwake.cli.main import build_app
 from rigwake.errors import InputError, RigwakeError, UsageError
 from rigwake.recording import CameraStream, Frame, Recording
+from rigwake.views.depth.depth_panorama import MATCHED
 from rigwake.views.frames import FrameWatch, frame_sets, require_fit
 from view_scenes import HEIGHT_M, PLACES, attitude, four_cameras, photograph, water_and_ring, write_rig
 
@@ -243,3 +244,27 @@ def test_video_of_a_recording_with_a_bad_camera(scene: Path, tmp_path: Path) -> 
     assert isinstance(error, InputError)
     assert error.exit_code == 1
     assert not (tmp_path / "y.mp4").exists()
+
+
+@pytest.mark.slow
+def test_depth_pair_by_pair_and_all_around(scene: Path, tmp_path: Path) -> None:
+    """Both find the ring; the pictures are a folder without a way, so nothing earlier is looked at."""
+    for words in ([], ["--sweep"]):
+        out = tmp_path / ("swept" if words else "paired")
+        arguments = [
+            "depth",
+            scene / "rig.yaml",
+            scene / "pictures",
+            "-o",
+            out,
+            "--height-m",
+            HEIGHT_M,
+            *words,
+        ]
+        result = CliRunner().invoke(build_app(), list(map(str, arguments)))
+        assert result.exit_code == 0, result.output
+        (file,) = out.glob("*.npz")
+        found = np.load(file)
+        matched = found["range_m"][found["source"] == MATCHED]
+        assert len(matched) > 1000
+        assert np.median(np.abs(matched / 12.0 - 1)) < 0.1

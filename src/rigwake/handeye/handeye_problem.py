@@ -321,8 +321,8 @@ def strides_of_both(
         return None
     step = max((end - begin) // _MOST_POSES, stride_ns // 4)
     starts = np.arange(begin, end, step, dtype=np.int64)
-    kept = _unbroken(member, starts, starts + stride_ns)
-    kept &= _unbroken(reference, starts + offset_ns, starts + stride_ns + offset_ns)
+    kept = is_unbroken(member, starts, starts + stride_ns)
+    kept &= is_unbroken(reference, starts + offset_ns, starts + stride_ns + offset_ns)
     starts = starts[kept]
     if len(starts) < _FEWEST_STRIDES:
         return None
@@ -332,7 +332,9 @@ def strides_of_both(
     )
 
 
-def _unbroken(trajectory: Trajectory, first: NDArray[np.int64], last: NDArray[np.int64]) -> NDArray[np.bool_]:
+def is_unbroken(
+    trajectory: Trajectory, first: NDArray[np.int64], last: NDArray[np.int64]
+) -> NDArray[np.bool_]:
     """Whether both ends lie between neighbouring poses, not within a gap, and in one segment."""
     ids, stamps = trajectory.segment_ids, trajectory.timestamps_ns
     assert ids is not None

@@ -57,8 +57,19 @@ def relative_scale(
     for stride_s in _STRIDES_S:
         both = strides_of_both(reference, member, offset_s, stride_s)
         if both is not None and len(both[0]) >= _PARTS * _FEWEST_PER_PART:
-            return _over_strides(*both, ref_from_member.rotation)
+            return _both_ways(*both, ref_from_member.rotation)
     return None
+
+
+def _both_ways(A: SE3, B: SE3, ref_from_member: Array) -> RelativeScale | None:
+    """Noise of the motion that the scale multiplies pulls it towards zero: with each in that place once, the truth lies
+    between, and half their distance is no less than that error."""
+    one, other = _over_strides(A, B, ref_from_member), _over_strides(B, A, ref_from_member.T)
+    if one is None or other is None:
+        return None
+    value = float(np.sqrt(one.value / other.value))
+    std = float(np.hypot(one.std, (1 / other.value - one.value) / 2))
+    return RelativeScale(value, std) if std < _USEFUL else None
 
 
 def _over_strides(A: SE3, B: SE3, ref_from_member: Array) -> RelativeScale | None:

@@ -12,7 +12,7 @@ import numpy as np
 from rigwake.atomic import write_text_atomic
 from rigwake.calibration import Calibration
 from rigwake.errors import RigwakeError
-from rigwake.logbook.store import Logbook
+from rigwake.logbook.store import Logbook, LoggedVerdict
 from rigwake.monitor.monitor_page import write_page
 from rigwake.monitor.monitor_report import logged_verdicts, result_to_dict
 from rigwake.monitor.recalibration import Recalibration, camera_to_measure, recalibrate
@@ -79,15 +79,23 @@ def recalibrate_with_log(
     try:
         found = recalibrate(calibration, result)
         save(found.calibration)
-    except RigwakeError as error:
+        _log_recalibrated(found, before, str(recalibrated(during)), recording, log)
+    except BaseException as error:  # an interrupt too: the camera must not stay RECALIBRATING
+        reason = error.cause if isinstance(error, RigwakeError) else "it was ended"
         with Logbook(log) as book:
-            words = f"{before.words}; not recalibrated: {error.cause}"
-            book.add_verdicts(number, [replace(before, words=words)])
+            book.add_verdicts(number, [replace(before, words=f"{before.words}; not recalibrated: {reason}")])
         raise
+    return found
+
+
+def _log_recalibrated(
+    found: Recalibration, before: LoggedVerdict, state: str, recording: Recording, log: Path
+) -> None:
+    """The new calibration supersedes the old one, and the camera is in a new state."""
     std = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(found.covariance)[-1])))
     after = replace(
         before,
-        state=str(recalibrated(during)),
+        state=state,
         size_deg=None,
         std_deg=None,
         words=f"recalibrated to {std:.3f} deg",
@@ -96,7 +104,6 @@ def recalibrate_with_log(
     )
     with Logbook(log) as book:
         new = book.add(
-            found.calibration, found.since_ns, note=f"{camera} recalibrated from {recording.path.name}"
+            found.calibration, found.since_ns, note=f"{before.camera} recalibrated from {recording.path.name}"
         )
         book.add_verdicts(new, [after])
-    return found

@@ -22,7 +22,7 @@ from rigwake.plausibility.picture_checks import check_pictures
 from rigwake.plausibility.receiver_checks import vet_receiver
 from rigwake.plausibility.receiver_fit import level_path
 from rigwake.plausibility.stamp_rates import rate_of_stamps, turns_of, varies, with_rate
-from rigwake.plausibility.turn_checks import EXPLAINED, check_clocks, check_mounts, check_scale
+from rigwake.plausibility.turn_checks import EXPLAINED, check_clocks, check_mounts, check_scale, mount_change
 from rigwake.plausibility.turn_fit import TurnFit, camera_as_gyroscope, fit_turns
 from rigwake.plausibility.values import SensorCheck, disagreeing, refuse
 from rigwake.recording import CameraStream, GnssStream, ImuStream
@@ -237,7 +237,8 @@ def _odd_ones(fits: Mapping[str, TurnFit]) -> dict[str, float]:
     for name, figure in left.items():
         others = [x for other, x in left.items() if other != name]
         usual = float(np.median(others)) if others else 1.0
-        if usual < _WELL_EXPLAINED and figure > max(EXPLAINED, _FAR_WORSE * usual):
+        odd = usual < _WELL_EXPLAINED and figure > max(EXPLAINED, _FAR_WORSE * usual)
+        if odd and mount_change(fits[name]) is None:  # a knock is told with its time, below
             found[name] = figure
     return found
 

@@ -21,7 +21,7 @@ from rigwake.pipeline.rig_stage import RigEstimate, estimate_rig, initialise_rig
 from rigwake.pipeline.sensor_checks import VettedSensors, vet_sensors
 from rigwake.pipeline.stream_selection import Selection
 from rigwake.plausibility.exposure_lag import exposure_lags, later_by, restamped
-from rigwake.plausibility.values import SensorCheck
+from rigwake.plausibility.values import SensorCheck, refuse
 from rigwake.recording import Recording
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
@@ -65,8 +65,11 @@ def estimate_vetted_rig(
     Raises InputError that names a sensor that cannot be right, and as `initialise_rig` and `estimate_rig`.
     """
     by_stamps: tuple[SensorCheck, ...] = ()
-    if config.sensor_checks and config.repair:
-        selection, tracks, trajectories, by_stamps = _restamped(selection, tracks, trajectories)
+    if config.sensor_checks:
+        selection, tracks, trajectories, by_stamps = _restamped(
+            selection, tracks, trajectories, config.repair
+        )
+        refuse(by_stamps)
     mended = MendedLenses(selection, tracks, trajectories)
     odometry = None if external else replace(config.odometry, seed=config.seed)
     refines = config.intrinsics != "fixed" and config.repair
@@ -87,15 +90,17 @@ def estimate_vetted_rig(
 
 
 def _restamped(
-    selection: Selection, tracks: Mapping[str, Tracks], trajectories: Mapping[str, Trajectory]
+    selection: Selection, tracks: Mapping[str, Tracks], trajectories: Mapping[str, Trajectory], repair: bool
 ) -> tuple[Selection, dict[str, Tracks], dict[str, Trajectory], tuple[SensorCheck, ...]]:
-    """Stamps that depend on how long a frame lasts, corrected everywhere."""
+    """Stamps that depend on how long a frame lasts, corrected everywhere; only told of where that cannot be."""
     cameras, tracks, paths = dict(selection.cameras), dict(tracks), dict(trajectories)
     stamps = {name: cameras[name].timestamps_ns for name in paths}
     lags = {} if selection.imu is None else exposure_lags(paths, stamps, selection.imu)
     checks = []
     for name, lag in lags.items():
-        if (moved := later_by(lag, stamps[name])) is None:
+        moved = later_by(lag, stamps[name]) if repair else None
+        if moved is None:  # where it cannot be corrected, the clock is said to drift
+            checks += [] if repair else [lag.check(name, repaired=False)]
             continue
         cameras[name] = replace(cameras[name], timestamps_ns=stamps[name] + moved)
         tracks[name] = restamped(tracks[name], stamps[name], moved)

@@ -21,7 +21,7 @@ from rigwake.geometry import so3
 from rigwake.odometry.gyro import integrate_gyro
 from rigwake.plausibility.turn_checks import EXPLAINED
 from rigwake.plausibility.turn_fit import TurnFit, fit_turns
-from rigwake.plausibility.values import SensorCheck
+from rigwake.plausibility.values import Action, SensorCheck
 from rigwake.recording import ImuStream
 from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
@@ -47,16 +47,18 @@ class ExposureLag:
     std: float
     periods_s: tuple[float, float]
 
-    def check(self, camera: str) -> SensorCheck:
-        """The words for it, once the stamps are corrected."""
+    def check(self, camera: str, *, repaired: bool = True) -> SensorCheck:
+        """The words for it; repaired: the stamps are corrected."""
         shortest, longest = (1e3 * period for period in self.periods_s)
         words = (
             f"its images are stamped later the longer a frame lasts, by {self.slope:.2f} ± {self.std:.2f} of its "
-            f"period ({shortest:.0f} to {longest:.0f} ms: automatic exposure?); the stamps are corrected for that."
+            f"period ({shortest:.0f} to {longest:.0f} ms: automatic exposure?)"
+            + ("; the stamps are corrected for that." if repaired else ".")
         )
         remedy = "Fix the exposure time, or stamp images in the middle of their exposure."
         quantity = "part of a frame's period by which stamps are late"
-        return SensorCheck(f"camera {camera}", False, self.slope, 0.0, words, remedy, quantity, "repaired")
+        action: Action = "repaired" if repaired else "none"
+        return SensorCheck(f"camera {camera}", False, self.slope, 0.0, words, remedy, quantity, action)
 
 
 def frame_periods(stamps: Stamps) -> Array:

@@ -84,7 +84,7 @@ class ForceEquations:
 
     def __init__(self, trajectory: Trajectory, imu: ImuStream, turns: TurnFit) -> None:
         path = longest_segment(trajectory)
-        on_imu = path.timestamps_ns + round(turns.time_offset_s * 1e9)
+        on_imu = path.timestamps_ns + turns.offsets_ns(path.timestamps_ns)
         first = max(int(on_imu[0]), int(imu.timestamps_ns[0])) + round((_H_S + 0.05) * 1e9)
         last = min(int(on_imu[-1]), int(imu.timestamps_ns[-1])) - round((_H_S + 0.05) * 1e9)
         centres = np.arange(first, last, round(0.5 * _H_S * 1e9))
@@ -93,7 +93,7 @@ class ForceEquations:
         if len(centres) > _MOST:
             centres = centres[np.linspace(0, len(centres) - 1, _MOST).astype(np.int64)]
         h = round(_H_S * 1e9)
-        shift = round(turns.time_offset_s * 1e9)
+        shift = turns.offsets_ns(centres - round(turns.time_offset_s * 1e9))
         at = [
             interpolate(path.timestamps_ns, path.world_from_body, centres + k * h - shift) for k in (-1, 0, 1)
         ]

@@ -4,7 +4,7 @@ Hand-eye calibration finds one mounting and one time offset. Where a body was mo
 another rate, one value for all is wrong; robust weights hide it.
 Over strides of seconds the residual `log(B^-1 X^-1 A X)` is linear in a small change of the mounting (six numbers), of
 the time offset and of the scale; normal equations per block of ten seconds tell how these change. Noise is the
-scatter between neighbouring blocks, which a change between halves does not widen.
+scatter between blocks, near and far apart, so that slow drift counts; a change between halves does not widen it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from rigwake._types import Array
 from rigwake.geometry import so3
 from rigwake.geometry.interpolate import interpolate
 from rigwake.geometry.se3 import SE3
-from rigwake.handeye.handeye_problem import HandeyeResult
+from rigwake.handeye.handeye_problem import HandeyeResult, is_unbroken
+from rigwake.plausibility.handeye_fit import scaled_poses
 from rigwake.plausibility.values import SensorCheck
 from rigwake.trajectory import Trajectory
 
@@ -29,11 +30,13 @@ _FEWEST_STRIDES = 8
 _MOST_STRIDES = 6000  # enough for an hour; more only repeats them
 _SHIFT_S = 0.01  # of the time offset, for its derivative
 _HUBER = 1.5
-_MOUNTING, _OFFSET, _SCALE = slice(0, 6), 6, 7
+_OFFSET, _SCALE = 6, 7
 # what one block may tell nothing about keeps these deviations: metres, radians, seconds, of one
 _PRIOR_STD = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 1.0, 1.0])
 _CHI2_CHANGE = 60.0  # six degrees of freedom, many splits, and drift of odometry lasts longer than a block
 _SIGMAS = 6.0
+_NEXT_BLOCKS = 3  # on each side of a split
+_SUDDEN = 5.0  # times what is usual between blocks next to each other
 _LEAST_TURN_DEG = 0.3
 _LEAST_SHIFT_M = 0.1
 _LEAST_RATE = 2e-4  # of one: clocks of computers keep 1e-4
@@ -73,7 +76,7 @@ def check_steadiness(
     blocks = _blocks(strides)
     if len(blocks.times_s) < _FEWEST_BLOCKS:
         return tuple(c for c in (frozen,) if c)
-    variance = _variance_between_neighbours(blocks)
+    variance = _variance_between_blocks(blocks)
     found = (
         frozen,
         _check_rate(blocks, variance, reference, member),
@@ -91,9 +94,12 @@ def _strides(reference: Trajectory, member: Trajectory, result: HandeyeResult) -
     inside = (at >= reference.timestamps_ns[0] + shift_ns) & (at <= reference.timestamps_ns[-1] - shift_ns)
     rows = np.flatnonzero(inside)
     starts, ends = _pairs(member, rows)
+    for moved_ns in (-shift_ns, shift_ns):  # poses of the reference within a gap are a guess
+        whole = is_unbroken(reference, at[starts] + moved_ns, at[ends] + moved_ns)
+        starts, ends = starts[whole], ends[whole]
     if len(starts) < _FEWEST_STRIDES:
         return None
-    here = _scaled(member, result)
+    here = scaled_poses(member, result)
     B = here[starts].inverse() * here[ends]
 
     def residuals(moved_ns: int) -> Array:
@@ -129,15 +135,6 @@ def _pairs(member: Trajectory, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp]
     ends = ends[starts]
     good = (ids[rows[starts]] == ids[rows[ends]]) & (stamps[ends] - stamps[starts] < 1.5 * _STRIDE_S * 1e9)
     return rows[starts[good]], rows[ends[good]]
-
-
-def _scaled(member: Trajectory, result: HandeyeResult) -> SE3:
-    scales = result.scales.get(member.name)
-    if scales is None or not len(scales):
-        return member.world_from_body
-    _, number = np.unique(np.asarray(member.segment_ids), return_inverse=True)
-    size = scales[np.minimum(number, len(scales) - 1), 0]
-    return SE3(member.world_from_body.rotation, member.world_from_body.translation * size[:, None])
 
 
 def _derivatives(B: SE3, by_offset: Array) -> Array:
@@ -180,17 +177,23 @@ def _spread(values: Array) -> float:
     return float(1.4826 * np.median(np.abs(values)))
 
 
-def _variance_between_neighbours(blocks: _BlockEquations) -> float:
-    """By how much neighbouring blocks differ more than independent residuals would let them; a median, so that one
-    change does not count."""
+def _variance_between_blocks(blocks: _BlockEquations) -> float:
+    """By how much blocks differ more than independent residuals would let them: the largest of medians over pairs 1, 2,
+    4 .. blocks apart. Drift that lasts shows in pairs far apart; of a change between halves, pairs on one side of it
+    are the most."""
+    lags = [lag for lag in (1, 2, 4, 8, 16, 32) if lag <= len(blocks.g) // 4] or [1]
+    return max([1.0, *(_variance_at(blocks, lag) for lag in lags)])
+
+
+def _variance_at(blocks: _BlockEquations, lag: int) -> float:
     prior = np.diag(_PRIOR_STD**-2)
     apart = []
-    for first in range(len(blocks.g) - 1):
-        two = slice(first, first + 2)
+    for first in range(len(blocks.g) - lag):
+        two = [first, first + lag]
         alone = sum(_gain(H + prior, g) for H, g in zip(blocks.H[two], blocks.g[two], strict=True))
         together = _gain(blocks.H[two].sum(axis=0) + 2 * prior, blocks.g[two].sum(axis=0))
         apart.append((alone - together) / 8)
-    return max(float(np.median(apart)), 1.0)
+    return float(np.median(apart))
 
 
 def _gain(H: Array, g: Array) -> float:
@@ -251,11 +254,13 @@ def _check_rate(
 
 
 def _check_change(blocks: _BlockEquations, variance: float, member: Trajectory) -> SensorCheck | None:
-    """The split into before and after that explains most, if it explains more than chance and odometry's drift."""
-    H = blocks.H[:, _MOUNTING, _MOUNTING]
+    """The split into before and after that explains most, if it explains more than chance and than drift of the
+    odometry, and all at once. The scale may differ on both sides."""
+    varied = np.array([*range(6), _SCALE])
     rest, _ = _solve(blocks.H.sum(axis=0), blocks.g.sum(axis=0), variance)
-    g = blocks.g[:, _MOUNTING] - blocks.H[:, _MOUNTING, _OFFSET:] @ rest[_OFFSET:]
-    prior = np.diag(_PRIOR_STD[_MOUNTING] ** -2)
+    H = blocks.H[:, varied[:, None], varied]
+    g = blocks.g[:, varied] - blocks.H[:, varied, _OFFSET] * rest[_OFFSET]
+    prior = np.diag(_PRIOR_STD[varied] ** -2)
     H_before, g_before = np.cumsum(H, axis=0), np.cumsum(g, axis=0)
     H_after, g_after = H_before[-1] - H_before + prior, g_before[-1] - g_before
     whole = _gain(H_before[-1] + prior, g_before[-1])
@@ -265,10 +270,12 @@ def _check_change(blocks: _BlockEquations, variance: float, member: Trajectory) 
     if not gains or max(gains) / variance < _CHI2_CHANGE:
         return None
     k = splits[int(np.argmax(gains))]
+    if not _is_sudden(H, g, prior, k):
+        return None
     apart = np.linalg.solve(H_after[k], g_after[k]) - np.linalg.solve(H_before[k], g_before[k])
     std = np.sqrt(variance * np.diag(np.linalg.inv(H_before[k]) + np.linalg.inv(H_after[k])))
     clear = np.where(np.abs(apart) > _SIGMAS * std, apart, 0.0)
-    turned, moved = float(np.degrees(np.linalg.norm(clear[3:]))), float(np.linalg.norm(clear[:3]))
+    turned, moved = float(np.degrees(np.linalg.norm(clear[3:6]))), float(np.linalg.norm(clear[:3]))
     words = [f"turned by {turned:.1f} deg"] * (turned > _LEAST_TURN_DEG)
     words += [f"moved by {moved:.2f} m"] * (moved > _LEAST_SHIFT_M)
     if not words:
@@ -283,3 +290,21 @@ def _check_change(blocks: _BlockEquations, variance: float, member: Trajectory) 
         f"Calibrate the parts before and after {when:.0f} s separately.",
         "change of the mounting, chi-square",
     )
+
+
+def _is_sudden(H: Array, g: Array, prior: Array, k: int) -> bool:
+    """Whether the blocks next to a split differ far more than those next to other places do: drift changes little by
+    little, everywhere."""
+    width = min(_NEXT_BLOCKS, (len(g) - 2) // 3)
+    if width < 1:
+        return False
+
+    def apart(split: int) -> float:
+        sides = (slice(split - width + 1, split + 1), slice(split + 1, split + 1 + width))
+        alone = sum(_gain(H[side].sum(axis=0) + prior, g[side].sum(axis=0)) for side in sides)
+        both = slice(sides[0].start, sides[1].stop)
+        return max(alone - _gain(H[both].sum(axis=0) + 2 * prior, g[both].sum(axis=0)), 0.0)
+
+    splits = range(width - 1, len(g) - width)
+    elsewhere = [apart(split) for split in splits if abs(split - k) >= width]
+    return k in splits and len(elsewhere) > 1 and apart(k) > _SUDDEN**2 * float(np.median(elsewhere))

@@ -27,6 +27,7 @@ _STRIDE_S = 1.0
 _FEWEST = 5
 _DOUBTFUL, _WRONG = 0.1, 0.3  # of the motion; between them only what a hypothesis explains is wrong
 _CLEARLY_BETTER = 0.3
+_LEAST_SCALE, _SIGMAS = 0.1, 5.0  # less is the error of an odometry, which its covariance counts
 _LEAST_TURN, _LEAST_WAY = np.deg2rad(0.5), 0.02  # radians, metres in a stride: less says nothing
 
 
@@ -63,13 +64,7 @@ def fit_of_handeye(reference: Trajectory, member: Trajectory, result: HandeyeRes
     if len(starts) < _FEWEST:
         return HandeyeFit(np.nan, np.nan)
     there = interpolate(reference.timestamps_ns, reference.world_from_body, at[rows])
-    scales = result.scales.get(member.name)
-    size = np.ones(len(rows))
-    if scales is not None and len(scales):
-        _, number = np.unique(ids, return_inverse=True)
-        size = scales[np.minimum(number[rows], len(scales) - 1), 0]
-    here = member.world_from_body[rows]
-    here = SE3(here.rotation, here.translation * size[:, None])
+    here = scaled_poses(member, result)[rows]
     A, B = (poses[starts].inverse() * poses[ends] for poses in (there, here))
     left = B.inverse() * (X.inverse() * A * X)
     turned, turns = so3.log(left.rotation), so3.log(B.rotation)
@@ -78,6 +73,22 @@ def fit_of_handeye(reference: Trajectory, member: Trajectory, result: HandeyeRes
         _ratio(turned, turns, _LEAST_TURN),
         _ratio(left.translation[known], B.translation[known], _LEAST_WAY if member.is_metric else 0.0),
     )
+
+
+def scaled_poses(member: Trajectory, result: HandeyeResult) -> SE3:
+    """The member's poses with the scale of each segment that was estimated; NaN translations of segments without."""
+    scales, ids = result.scales.get(member.name), member.segment_ids
+    poses = member.world_from_body
+    if scales is None or not len(scales):
+        return poses
+    assert ids is not None
+    counts = np.bincount(ids)
+    # those that the estimate kept, in its order (see `longest_segments`)
+    present = np.flatnonzero(counts)
+    kept = np.sort(present[np.argsort(-counts[present], kind="stable")[: len(scales)]])
+    size = np.full(len(counts), np.nan)
+    size[kept] = scales[: len(kept), 0]
+    return SE3(poses.rotation, poses.translation * size[ids][:, None])
 
 
 def _ratio(left: Array, whole: Array, least: float) -> float:
@@ -200,13 +211,15 @@ def _scale_cause(
         result = calibrate_handeye(reference, [member], replace(options, scale=True))
     except (RigwakeError, ValueError, np.linalg.LinAlgError):
         return ""
-    left = fit_of_handeye(reference, member, result).worst
+    fit = fit_of_handeye(reference, member, result)
     scales = result.scales.get(member.name, np.zeros((0, 2)))
-    if not len(scales) or not left < _CLEARLY_BETTER * given.worst:
+    if not len(scales) or not np.isfinite(fit.translation) or not fit.worst < _CLEARLY_BETTER * given.worst:
+        return ""
+    if not abs(scales[0, 0] - 1) > max(_LEAST_SCALE, _SIGMAS * scales[0, 1]):
         return ""
     return (
         f"its lengths are {1 / scales[0, 0]:.3f} times those of {reference.name} (--scale estimates that): "
-        f"then {100 * left:.1f} % is left"
+        f"then {100 * fit.worst:.1f} % is left"
     )
 
 

@@ -30,9 +30,7 @@ def stamp_jitter(trajectory: Trajectory, imu: ImuStream, fit: TurnFit) -> float 
     poses, None where the camera turns too little."""
     stamps, ids = trajectory.timestamps_ns, trajectory.segment_ids
     assert ids is not None
-    middle = int(fit.start_ns[len(fit.start_ns) // 2])
-    late_s = fit.time_offset_s + fit.drift * (stamps - middle) * 1e-9
-    at = stamps + np.round(late_s * 1e9).astype(np.int64)
+    at = stamps + fit.offsets_ns(stamps)
     first, last = imu.timestamps_ns[0], imu.timestamps_ns[-1]
     turned = integrate_gyro(imu, fit.gyro_bias).at(np.clip(at, first, last))
     by_gyro = np.swapaxes(turned[:-1], 1, 2) @ turned[1:]

@@ -30,6 +30,7 @@ from rigwake.tracks import Tracks
 from rigwake.trajectory import Trajectory
 
 _FEWEST_PAIRS = 8
+_FEWEST_OF_A_THIRD = 15
 _ROUNDS = 12
 _STEP_PX = 0.05
 _REPEATS = 4
@@ -82,11 +83,11 @@ def fit_lens(
 def focal_growth(tracks: Tracks, model: CameraModel, trajectory: Trajectory) -> tuple[float, float] | None:
     """Focal length in the last third of the pairs of images over that in the first, less one, and its deviation.
 
-    None where a third has fewer than 8 pairs.
+    None where a third has fewer than 15 pairs: the scatter of fewer does not tell their deviation.
     """
     pairs = choose_pairs(tracks, trajectory)
     third = len(pairs.rotation) // 3
-    if third < _FEWEST_PAIRS:
+    if third < _FEWEST_OF_A_THIRD:
         return None
     ends = [np.arange(third), np.arange(len(pairs.rotation) - third, len(pairs.rotation))]
     first, last = (_minimise(pairs.take(index), model, _SCALE_STD) for index in ends)

@@ -55,6 +55,11 @@ class TurnFit:
     end_ns: Stamps
     segments: NDArray[np.int64]
 
+    def offsets_ns(self, stamps: Stamps) -> Stamps:
+        """(N,) what to add to stamps of the camera's clock, by time offset and drift."""
+        middle = int(self.start_ns[len(self.start_ns) // 2])
+        return np.round(1e9 * self.time_offset_s + self.drift * (stamps - middle)).astype(np.int64)
+
     @property
     def std(self) -> Array:
         """(9,) standard deviations of the unknowns."""
