@@ -20,10 +20,11 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $(STAMP) $(DEMO_STAMP)
 
-# what only developers need takes longer to install than the demo to run
+# what only developers need takes longer to install than the demo to run; most of what is installed is never imported,
+# so that Python compiles what it needs
 $(DEMO_STAMP): pyproject.toml constraints.txt
 	$(environment)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[sim]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt --no-compile -e '.[sim]'
 	@touch $(DEMO_STAMP)
 
 demo: $(DEMO_STAMP)

@@ -3,6 +3,9 @@
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,6 +13,7 @@ import pytest
 
 from rigwake.pipeline import camera_processes
 from rigwake.pipeline.camera_processes import process_cameras
+from rigwake.workers import in_background
 
 CAMERAS = [SimpleNamespace(stream=SimpleNamespace(name=name)) for name in ("left", "right")]
 
@@ -48,3 +52,19 @@ def test_compiling_is_the_first_job_where_there_are_processes(
     outcomes = process_cameras(CAMERAS, processes, lambda *a: None, done.append)
     assert given == asked
     assert outcomes == done == ["left", "right"]
+
+
+def test_work_in_the_background_goes_on_meanwhile_and_ends_with_the_block(tmp_path: Path) -> None:
+    with in_background(partial(Path.touch, tmp_path / "done")):
+        assert wait_until((tmp_path / "done").exists)
+    started = time.monotonic()
+    with in_background(partial(time.sleep, 60)):
+        pass
+    assert time.monotonic() - started < 30
+
+
+def wait_until(true: Callable[[], bool]) -> bool:
+    patience = time.monotonic() + 60
+    while not true() and time.monotonic() < patience:
+        time.sleep(0.05)
+    return true()

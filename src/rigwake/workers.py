@@ -74,6 +74,31 @@ def run_in_processes(
 
 
 @contextlib.contextmanager
+def in_background(work: Callable[[], object]) -> Iterator[None]:
+    """`work()` in a process of its own, meanwhile, with low priority; ended when the block is left."""
+    process = multiprocessing.get_context("spawn").Process(
+        target=_beside, args=(work, os.getpid()), daemon=True
+    )
+    with _main_module_stays_here():
+        process.start()
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.join(_PATIENCE_S)
+        if process.is_alive():
+            process.kill()
+
+
+def _beside(work: Callable[[], object], parent: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _end_with_parent(parent)
+    if hasattr(os, "nice"):
+        os.nice(5)
+    work()
+
+
+@contextlib.contextmanager
 def _main_module_stays_here() -> Iterator[None]:
     """Workers started within do not run the caller's script again, so that it needs no `if __name__ == "__main__"`.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -23,6 +24,8 @@ def command(
     Example: [cyan]rigwake demo -o demo[/cyan]
     """
     from rigwake.cli import calibrate, evaluate, report, simulate, surround
+    from rigwake.pipeline.kernel_warmup import compile_handeye, handeye_is_compiled
+    from rigwake.workers import in_background
 
     require_writable("-o", folder, folder=True)
 
@@ -31,7 +34,9 @@ def command(
         out.print(f"{recording} is there already: not simulated again.")
     else:
         folder.mkdir(parents=True, exist_ok=True)
-        simulate.command("demo", output=recording)
+        # the renderer begins on one core
+        with nullcontext() if handeye_is_compiled() else in_background(compile_handeye):
+            simulate.command("demo", output=recording)
     calibrate.command(recording, result, force=True)
     evaluate.command(result / "calibration.yaml", folder / "harbour_truth" / "truth.yaml")
     surround.command(result / "calibration.yaml", recording, output=result / "surround", radius_m=20.0)
