@@ -67,6 +67,7 @@ class Seen:
     labels: Labels
     depth: DepthPanorama
     swept: DepthPanorama
+    swept_labels: Labels
     world: StixelWorld
     true_world: StixelWorld
     true_labels: np.ndarray
@@ -92,8 +93,9 @@ def estimate(rig: SurroundRig, shot: ViewShot, classifier: PixelClassifier, by_m
         fused = depth if found is labels else fuse_depth(matched, found, GRID, attitude)
         shift = contact_shifts(found, strip, shot.images, rig, attitude)
         worlds.append(find_stixels(found, GRID, attitude, *fused.inverse_horizontal(), shift))
-    by_sweep = fuse_depth(swept, tested_by_height(alone, swept, GRID, attitude, before), GRID, attitude)
-    return Seen(shot, strip, alone, labels, depth, by_sweep, *worlds, true_labels)
+    swept_labels = tested_by_height(alone, swept, GRID, attitude, before)
+    by_sweep = fuse_depth(swept, swept_labels, GRID, attitude)
+    return Seen(shot, strip, alone, labels, depth, by_sweep, swept_labels, *worlds, true_labels)
 
 
 def labels_drawn(rig: SurroundRig, shot: ViewShot, strip: LevelStrip) -> np.ndarray:
@@ -198,8 +200,8 @@ def _free_areas(s: Seen, world: StixelWorld) -> tuple[float, float]:
 def depth_rows(name: str, seen: Sequence[Seen], rig: SurroundRig) -> list[str]:
     """Errors of matched ranges on land and of the plane on water, density, and what the confidence is worth."""
     return [
-        _depth_row(name, [_depth_errors(s, s.depth) for s in seen]),
-        _depth_row("  sweep", [_depth_errors(s, s.swept) for s in seen]),
+        _depth_row(name, [_depth_errors(s, s.depth, s.labels) for s in seen]),
+        _depth_row("  sweep", [_depth_errors(s, s.swept, s.swept_labels) for s in seen]),
     ]
 
 
@@ -221,15 +223,17 @@ def _depth_row(name: str, found: Sequence[tuple[Array, Array, Array, float, Arra
     )
 
 
-def _depth_errors(s: Seen, depth: DepthPanorama) -> tuple[Array, Array, Array, float, Array, int]:
+def _depth_errors(
+    s: Seen, depth: DepthPanorama, labels: Labels
+) -> tuple[Array, Array, Array, float, Array, int]:
     true = s.shot.ranges_m
     land = (s.shot.labels == OBSTACLE) & s.strip.is_seen & (true < 100)
     matched = depth.source == MATCHED
     both = land & matched
     error = depth.range_m[both] / true[both] - 1
     water = (s.shot.labels == WATER) & (depth.source == PLANE) & (true < 30)
-    wrong = int((matched & (s.labels.classes == WATER)).sum())
-    density = float(matched[land & (s.labels.classes == OBSTACLE)].mean())
+    wrong = int((matched & (labels.classes == WATER)).sum())
+    density = float(matched[land & (labels.classes == OBSTACLE)].mean())
     return true[both], error, depth.confidence[both], density, depth.range_m[water] / true[water] - 1, wrong
 
 
