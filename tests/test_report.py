@@ -264,6 +264,20 @@ def test_sigmas_of_the_inverse_are_those_of_a_monte_carlo() -> None:
             "aft->mast 3.1 px",
         ),
         (
+            {
+                "hand_over": {
+                    "count": 92,
+                    "median_px": 0.13,
+                    "by_pair": {
+                        "aft->port": {"count": 90, "median_px": 0.12},
+                        "aft->mast": {"count": 2, "median_px": 1.4},
+                    },
+                }
+            },
+            "good",
+            "0.13 px off",
+        ),
+        (
             {"hand_over": {"count": 9, "median_px": 0.5, "by_pair": {"aft->aft": {"count": 9}}}},
             "usable",
             "No landmark went",

@@ -18,6 +18,7 @@ GOOD_POSITION_M = 0.03
 AGREEING_SIGMAS = 3.0
 GOOD_ASSOCIATION_PX = 2.0
 ODD_PAIR_PX, ODD_PAIR_RATIO = 1.0, 5.0  # a pair of cameras that is off by more than both stands out
+_FEW = 3.0  # with fewer than nine landmarks a pair may be further off, by this over the root of their number
 
 
 @dataclass(frozen=True)
@@ -231,7 +232,12 @@ def odd_pairs(association: Any) -> dict[str, float]:
         for pair, entry in pairs.items()
     }
     limit_px = odd_limit_px(median)
-    return {pair: off for pair, (off, count) in found.items() if off > limit_px and count > 1}
+    # the median of a few landmarks is off by chance
+    return {
+        pair: off
+        for pair, (off, count) in found.items()
+        if count > 1 and off > limit_px * max(1.0, _FEW / np.sqrt(count))
+    }
 
 
 def _between_cameras(association: Any) -> bool:
