@@ -12,7 +12,7 @@ from rigwake.geometry.se3 import SE3
 from rigwake.handeye.handeye_problem import HandeyeOptions
 from rigwake.handeye.joint_calibration import calibrate_handeye
 from rigwake.pipeline.handeye_run import run_handeye
-from rigwake.plausibility.handeye_drift import check_steadiness
+from rigwake.plausibility.handeye_drift import _strides, check_steadiness
 from rigwake.trajectory import Trajectory
 
 TIMES = np.arange(600) * 0.15
@@ -78,8 +78,11 @@ def scaled(poses: SE3, factor: float) -> SE3:
 def test_a_gap_of_the_reference_is_no_change() -> None:
     times = np.arange(0, 200, 0.2)
     rig, port = pair(times=times)
-    kept = np.flatnonzero((times < 60) | (times > 95))
-    assert check_steadiness(rig.take(kept), port, calibrate_handeye(rig, [port])) == ()
+    kept, result = rig.take(np.flatnonzero((times < 60) | (times > 95))), calibrate_handeye(rig, [port])
+    assert check_steadiness(kept, port, result) == ()
+    strides = _strides(kept, port, result)
+    assert strides is not None
+    assert not np.any((strides.times_s > 60) & (strides.times_s < 95))
 
 
 @pytest.mark.parametrize("seed", [1, 2])

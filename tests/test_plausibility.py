@@ -388,3 +388,9 @@ def test_refusing_names_sensor_and_remedy_and_checks_survive_their_file() -> Non
     assert stuck["expected"] is None
     assert stuck["hypothesis"] == "it is stuck."
     refuse(checks[1:])
+
+
+def test_offsets_follow_the_drift() -> None:
+    none, stamps = np.zeros((3, 3)), 10**9 * np.arange(5)
+    fit = TurnFit(np.eye(3), np.zeros(3), 0.02, 1.0, 1e-4, np.eye(9), 0.0, none, none, stamps, stamps, stamps)
+    np.testing.assert_array_equal(fit.offsets_ns(stamps), 20_000_000 + 100_000 * np.arange(-2, 3))

@@ -264,7 +264,7 @@ def test_depth_pair_by_pair_and_all_around(scene: Path, tmp_path: Path) -> None:
         result = CliRunner().invoke(build_app(), list(map(str, arguments)))
         assert result.exit_code == 0, result.output
         (file,) = out.glob("*.npz")
-        found = np.load(file)
-        matched = found["range_m"][found["source"] == MATCHED]
+        with np.load(file) as found:
+            matched = found["range_m"][found["source"] == MATCHED]
         assert len(matched) > 1000
         assert np.median(np.abs(matched / 12.0 - 1)) < 0.1
