@@ -139,6 +139,14 @@ def _node_twists(increments: Array, steps: Array) -> Array:
     return twists
 
 
+def longest_segment_ids(trajectory: Trajectory, most: int) -> NDArray[np.int64]:
+    """Numbers of the `most` longest segments, in their order in time."""
+    assert trajectory.segment_ids is not None
+    counts = np.bincount(trajectory.segment_ids)
+    present = np.flatnonzero(counts)
+    return np.sort(present[np.argsort(-counts[present], kind="stable")[:most]])
+
+
 def longest_segments(trajectory: Trajectory, most: int) -> tuple[Trajectory, int]:
     """The trajectory with its `most` longest segments, numbered from 0, and how many poses of others were left out.
 
@@ -146,11 +154,9 @@ def longest_segments(trajectory: Trajectory, most: int) -> tuple[Trajectory, int
     """
     ids = trajectory.segment_ids
     assert ids is not None
-    counts = np.bincount(ids)
-    present = np.flatnonzero(counts)
-    if len(present) <= most:
+    kept = longest_segment_ids(trajectory, most)
+    if np.isin(ids, kept).all():
         return trajectory, 0
-    kept = np.sort(present[np.argsort(-counts[present], kind="stable")[:most]])
     rows = np.flatnonzero(np.isin(ids, kept))
     covariances = None if trajectory.covariances is None else trajectory.covariances[rows]
     # covariances of increments stay true: within a segment nothing is thinned

@@ -163,8 +163,7 @@ def _words(name: str, scores: BlockScores, statistics: BlockStatistics, threshol
     largest = f"largest {statistics.value[block, camera]:.0f} of {thresholds.alarm:g} ({scores.cameras[camera]}, {at})"
     seen = np.sort(statistics.std_deg[-1], axis=None)
     seen = seen[np.isfinite(seen)]
-    sees = (
-        len(seen) > 0 and 5 * seen[0] < _LARGEST_TURN_DEG
-    )  # before a cue knows its offsets, it sees nothing
+    # before a cue knows its offsets, it sees nothing
+    sees = len(seen) > 0 and 5 * seen[0] < _LARGEST_TURN_DEG
     to = f"; sees turns of {5 * seen[0]:.2f} deg and more" if sees else ""
     return f"{name}: {largest}{to}"

@@ -12,14 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rigwake._robust import robust_std
 from rigwake._types import Array
 from rigwake.geometry import so3
-from rigwake.geometry.interpolate import interpolate
 from rigwake.geometry.se3 import SE3
 from rigwake.handeye.handeye_problem import HandeyeResult, is_unbroken
-from rigwake.plausibility.handeye_fit import scaled_poses
+from rigwake.plausibility.handeye_fit import left_over, scaled_poses, stride_rows
 from rigwake.plausibility.values import SensorCheck
 from rigwake.trajectory import Trajectory
 
@@ -93,7 +92,7 @@ def _strides(reference: Trajectory, member: Trajectory, result: HandeyeResult) -
     at = member.timestamps_ns + round((camera.time_offset_s or 0.0) * 1e9)
     inside = (at >= reference.timestamps_ns[0] + shift_ns) & (at <= reference.timestamps_ns[-1] - shift_ns)
     rows = np.flatnonzero(inside)
-    starts, ends = _pairs(member, rows)
+    starts, ends = stride_rows(member, rows, _STRIDE_S, 1.5 * _STRIDE_S, _MOST_STRIDES)
     for moved_ns in (-shift_ns, shift_ns):  # poses of the reference within a gap are a guess
         whole = is_unbroken(reference, at[starts] + moved_ns, at[ends] + moved_ns)
         starts, ends = starts[whole], ends[whole]
@@ -103,11 +102,7 @@ def _strides(reference: Trajectory, member: Trajectory, result: HandeyeResult) -
     B = here[starts].inverse() * here[ends]
 
     def residuals(moved_ns: int) -> Array:
-        ends_of = [
-            interpolate(reference.timestamps_ns, reference.world_from_body, at[r] + moved_ns)
-            for r in (starts, ends)
-        ]
-        left = B.inverse() * (X.inverse() * (ends_of[0].inverse() * ends_of[1]) * X)
+        left = left_over(reference, X, B, at[starts] + moved_ns, at[ends] + moved_ns)
         return np.concatenate([left.translation, so3.log(left.rotation)], axis=1)
 
     around = residuals(0)
@@ -123,18 +118,6 @@ def _strides(reference: Trajectory, member: Trajectory, result: HandeyeResult) -
     return _StrideResiduals(
         around[known], jacobian[known], np.where(np.abs(motion) < 1e-7, 0.0, motion)[known], times[known]
     )
-
-
-def _pairs(member: Trajectory, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First and last row of strides within one segment."""
-    stamps, ids = member.timestamps_ns[rows], member.segment_ids
-    assert ids is not None
-    ends = np.searchsorted(stamps, stamps + round(_STRIDE_S * 1e9))
-    starts = np.flatnonzero(ends < len(stamps))
-    starts = starts[:: max(len(starts) // _MOST_STRIDES, 1)]
-    ends = ends[starts]
-    good = (ids[rows[starts]] == ids[rows[ends]]) & (stamps[ends] - stamps[starts] < 1.5 * _STRIDE_S * 1e9)
-    return rows[starts[good]], rows[ends[good]]
 
 
 def _derivatives(B: SE3, by_offset: Array) -> Array:
@@ -157,7 +140,7 @@ def _blocks(strides: _StrideResiduals) -> _BlockEquations:
     change = np.zeros(8)
     for _ in range(4):
         left = r - J @ change
-        std = np.repeat([max(_spread(left[:, :3]), 1e-6), max(_spread(left[:, 3:]), 1e-7)], 3)
+        std = np.repeat([max(robust_std(left[:, :3]), 1e-6), max(robust_std(left[:, 3:]), 1e-7)], 3)
         if not left[:, :3].any():
             std[:3] = np.inf
         size = np.linalg.norm(left / std, axis=1) / np.sqrt(6)
@@ -171,10 +154,6 @@ def _blocks(strides: _StrideResiduals) -> _BlockEquations:
     np.add.at(H_blocks, block, weight[:, None, None] * (np.swapaxes(white_J, 1, 2) @ white_J))
     np.add.at(g_blocks, block, weight[:, None] * np.einsum("nij,ni->nj", white_J, white_r))
     return _BlockEquations(H_blocks, g_blocks, np.asarray((kinds + 0.5) * _BLOCK_S))
-
-
-def _spread(values: Array) -> float:
-    return float(1.4826 * np.median(np.abs(values)))
 
 
 def _variance_between_blocks(blocks: _BlockEquations) -> float:

@@ -11,14 +11,16 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rigwake._types import Array
+from rigwake._types import Array, Stamps
 from rigwake.errors import InputError, RigwakeError
 from rigwake.geometry import so3
 from rigwake.geometry.interpolate import interpolate
 from rigwake.geometry.se3 import SE3
 from rigwake.handeye.handeye_problem import HandeyeOptions, HandeyeResult
 from rigwake.handeye.joint_calibration import calibrate_handeye
+from rigwake.handeye.motions import longest_segment_ids
 from rigwake.plausibility.values import SensorCheck
 from rigwake.trajectory import Trajectory
 
@@ -54,25 +56,43 @@ def fit_of_handeye(reference: Trajectory, member: Trajectory, result: HandeyeRes
     rows = np.flatnonzero(inside)
     if len(rows) < 2:
         return HandeyeFit(np.nan, np.nan)
-    stamps, ids = member.timestamps_ns[rows], member.segment_ids
-    assert ids is not None
-    ends = np.searchsorted(stamps, stamps + round(0.99 * _STRIDE_S * 1e9))
-    starts = np.flatnonzero(ends < len(stamps))
-    ends = ends[starts]
-    good = (ids[rows[starts]] == ids[rows[ends]]) & (stamps[ends] - stamps[starts] < 2 * _STRIDE_S * 1e9)
-    starts, ends = starts[good], ends[good]
+    starts, ends = stride_rows(member, rows, 0.99 * _STRIDE_S, 2 * _STRIDE_S)
     if len(starts) < _FEWEST:
         return HandeyeFit(np.nan, np.nan)
-    there = interpolate(reference.timestamps_ns, reference.world_from_body, at[rows])
-    here = scaled_poses(member, result)[rows]
-    A, B = (poses[starts].inverse() * poses[ends] for poses in (there, here))
-    left = B.inverse() * (X.inverse() * A * X)
+    here = scaled_poses(member, result)
+    B = here[starts].inverse() * here[ends]
+    left = left_over(reference, X, B, at[starts], at[ends])
     turned, turns = so3.log(left.rotation), so3.log(B.rotation)
     known = np.isfinite(left.translation).all(axis=1)
     return HandeyeFit(
         _ratio(turned, turns, _LEAST_TURN),
         _ratio(left.translation[known], B.translation[known], _LEAST_WAY if member.is_metric else 0.0),
     )
+
+
+def stride_rows(
+    member: Trajectory, rows: NDArray[np.intp], least_s: float, most_s: float, count: int | None = None
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First and last row, of those given, of strides within one segment that last `least_s` to `most_s`; count: not
+    many more than so many, evenly."""
+    stamps, ids = member.timestamps_ns[rows], member.segment_ids
+    assert ids is not None
+    ends = np.searchsorted(stamps, stamps + round(least_s * 1e9))
+    starts = np.flatnonzero(ends < len(stamps))
+    starts = starts[:: max(len(starts) // count, 1)] if count else starts
+    ends = ends[starts]
+    good = (ids[rows[starts]] == ids[rows[ends]]) & (stamps[ends] - stamps[starts] < most_s * 1e9)
+    return rows[starts[good]], rows[ends[good]]
+
+
+def left_over(
+    reference: Trajectory, ref_from_member: SE3, strides: SE3, starts_ns: Stamps, ends_ns: Stamps
+) -> SE3:
+    """`B^-1 X^-1 A X` of the member's strides B that begin and end at these times on the reference's clock."""
+    first, last = (
+        interpolate(reference.timestamps_ns, reference.world_from_body, at) for at in (starts_ns, ends_ns)
+    )
+    return strides.inverse() * (ref_from_member.inverse() * (first.inverse() * last) * ref_from_member)
 
 
 def scaled_poses(member: Trajectory, result: HandeyeResult) -> SE3:
@@ -82,11 +102,8 @@ def scaled_poses(member: Trajectory, result: HandeyeResult) -> SE3:
     if scales is None or not len(scales):
         return poses
     assert ids is not None
-    counts = np.bincount(ids)
-    # those that the estimate kept, in its order (see `longest_segments`)
-    present = np.flatnonzero(counts)
-    kept = np.sort(present[np.argsort(-counts[present], kind="stable")[: len(scales)]])
-    size = np.full(len(counts), np.nan)
+    kept = longest_segment_ids(member, len(scales))  # those that the estimate kept
+    size = np.full(int(ids.max()) + 1, np.nan)
     size[kept] = scales[: len(kept), 0]
     return SE3(poses.rotation, poses.translation * size[ids][:, None])
 

@@ -24,9 +24,8 @@ _TURNED = np.deg2rad(0.2)
 # by which the robust cost falls when a knock is undone: one bad rotation among many gains 0.1
 _CONFIRMED = 3.0
 _FEWEST = 8  # strides on either side of a change
-_MOST_SPLITS = (
-    200  # that are tried at once: of a long recording evenly spread ones, then those beside the best
-)
+# tried at once: of a long recording evenly spread ones, then those beside the best
+_MOST_SPLITS = 200
 
 
 def check_scale(
